@@ -255,10 +255,8 @@ class CloudFiles(AbstractFrames):
         os.scandir(folder).close()
         visible = (path for path in folder.glob(glob) if path.is_file() and not path.name.startswith("."))
         # Numbers count by value: scan_10.ply is ordered as ("scan_", 10), (".ply", 0).
-        paths = sorted(
-            visible,
-            key=lambda path: [(text, int(number or 0)) for text, number in re.findall(r"(\D*)(\d*)", path.name)],
-        )
+        runs = re.compile(r"(\D*)(\d*)")
+        paths = sorted(visible, key=lambda path: [(text, int(digits or 0)) for text, digits in runs.findall(path.name)])
         self.paths = [path for path in paths if is_cloud(path)]
         self.left_out = [path for path in paths if path not in self.paths]
         if not self.paths:

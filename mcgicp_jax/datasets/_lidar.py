@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io
@@ -52,10 +53,19 @@ class KITTIFrames(AbstractFrames):
         if not self._scans:
             raise ValueError(f"{folder}: expected scans in velodyne/*.bin, found none")
         super().__init__(len(self._scans))
-        calibration = _read_calibration(folder / "calib.txt")
+        calibration, matrices = folder / "calib.txt", {}
+        for line in calibration.read_text().splitlines():
+            name, _, numbers = line.partition(":")
+            # Other lines are no matrices, such as the date of the calibration.
+            with contextlib.suppress(ValueError):
+                matrices[name] = np.array(numbers.split(), float).reshape(3, 4)
+        for name in ("P2", "Tr"):
+            if name not in matrices:
+                names = ", ".join(matrices) or "none"
+                raise ValueError(f"{calibration}: expected a line {name}: with 12 numbers, found {names}")
         # Transform from the Velodyne to camera 0, and projection to the pixels of camera 2.
-        self.to_camera: Matrix = np.vstack([calibration["Tr"], [0, 0, 0, 1]])
-        self._projection = calibration["P2"] @ self.to_camera
+        self.to_camera: Matrix = np.vstack([matrices["Tr"], [0, 0, 0, 1]])
+        self._projection = matrices["P2"] @ self.to_camera
         times = folder / "times.txt"
         try:
             self._times = np.array(times.read_text().split(), float)
@@ -84,23 +94,6 @@ class KITTIFrames(AbstractFrames):
             pose = np.linalg.inv(self.to_camera) @ self._poses[number] @ self.to_camera
         time = float(self._times[number]) if number < len(self._times) else None
         return Frame(cloud, pose, time, image, pixels)
-
-
-def _read_calibration(path: Path) -> dict[str, Float[np.ndarray, "3 4"]]:
-    """The 3×4 matrices by name."""
-    matrices = {}
-    for line in path.read_text().splitlines():
-        name, _, numbers = line.partition(":")
-        try:
-            values = np.array(numbers.split(), float)
-        except ValueError:
-            continue  # such as the date of a calibration
-        if values.size == 12:
-            matrices[name] = values.reshape(3, 4)
-    for name in ("P2", "Tr"):
-        if name not in matrices:
-            raise ValueError(f"{path}: expected a line {name}: with 12 numbers, found {', '.join(matrices) or 'none'}")
-    return matrices
 
 
 def ford_campus(folder: str | os.PathLike[str]) -> FordFrames:

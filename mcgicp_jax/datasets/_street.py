@@ -33,14 +33,10 @@ _HALF_INTENSITY = 40.0
 
 # Metres from the middle of the street: parking bays, kerb, façades; height of the kerb; depth of the buildings.
 _PARKING, _KERB, _FACADE, _KERB_HEIGHT, _DEPTH = 3.0, 5.0, 8.5, 0.12, 12.0
-# Direction towards the sun, and colours: red, green and blue from 0 to 1.
+# Direction towards the sun, and colours of walls, cars and windows: red, green and blue from 0 to 1.
 _SUN = np.array([0.35, -0.5, 0.79])
-_PALETTE = np.array(
-    [[0.72, 0.45, 0.36], [0.80, 0.74, 0.62], [0.62, 0.60, 0.58], [0.86, 0.82, 0.76], [0.55, 0.36, 0.30]]
-)
-_CAR_PALETTE = np.array(
-    [[0.75, 0.10, 0.10], [0.90, 0.90, 0.90], [0.08, 0.08, 0.10], [0.15, 0.25, 0.55], [0.55, 0.57, 0.60]]
-)
+_WALLS = np.array([[0.72, 0.45, 0.36], [0.80, 0.74, 0.62], [0.62, 0.60, 0.58], [0.86, 0.82, 0.76], [0.55, 0.36, 0.30]])
+_CARS = np.array([[0.75, 0.10, 0.10], [0.90, 0.90, 0.90], [0.08, 0.08, 0.10], [0.15, 0.25, 0.55], [0.55, 0.57, 0.60]])
 _GLASS = np.array([0.16, 0.20, 0.26])
 # Surface patterns: width of the patches, metres, and amplitude, per layer.
 _ASPHALT = ((2.5, 0.035), (0.5, 0.03), (0.12, 0.02))
@@ -175,7 +171,7 @@ def _building(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]
     # Fit a whole number of windows and storeys, so that no window is cut off.
     pitch = np.array([width, height]) / np.round((width, height) / pitch)
     low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
-    color, reflectance = rng.choice(_PALETTE) * rng.uniform(0.85, 1.1), rng.uniform(0.25, 0.55)
+    color, reflectance = rng.choice(_WALLS) * rng.uniform(0.85, 1.1), rng.uniform(0.25, 0.55)
     windows = np.array([*pitch, *opening, rng.uniform(0.08, 0.25)])
     building = _Thing(_Kind.BUILDING, _box(low, high, side), color, reflectance, windows)
     # The next building is adjacent, behind a passage, or across a side street.
@@ -185,7 +181,7 @@ def _building(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]
 def _car(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     length, width, sill, roof = rng.uniform((3.6, 1.65, 0.85, 1.40), (4.9, 1.85, 1.05, 1.60))
     y = rng.uniform(_PARKING + 0.1, _KERB - width - 0.05)
-    color, reflectance = rng.choice(_CAR_PALETTE), rng.uniform(0.15, 0.6)
+    color, reflectance = rng.choice(_CARS), rng.uniform(0.15, 0.6)
     body = _box(np.array([x, y, 0.2]), np.array([x + length, y + width, sill]), side)
     bonnet, boot = rng.uniform((0.8, 0.2), (1.3, 0.8))
     low, high = np.array([x + bonnet, y + 0.12, sill]), np.array([x + length - boot, y + width - 0.12, roof])
