@@ -67,11 +67,8 @@ def rgb_to_hsv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     colored, bright = chroma > 0, value > 0
     scale = xp.where(colored, chroma, 1)
     # Multiples of 60°: red 0, green 2, blue 4.
-    sixths = xp.where(
-        value == red,
-        (green - blue) / scale,
-        xp.where(value == green, 2 + (blue - red) / scale, 4 + (red - green) / scale),
-    )
+    green_or_blue = xp.where(value == green, 2 + (blue - red) / scale, 4 + (red - green) / scale)
+    sixths = xp.where(value == red, (green - blue) / scale, green_or_blue)
     saturation = xp.where(bright, chroma / xp.where(bright, value, 1), 0)
     hue = np.pi / 3 * sixths
     return xp.stack([saturation * xp.cos(hue), saturation * xp.sin(hue), value], -1)

@@ -16,9 +16,8 @@ Columns: TypeAlias = dict[str, Shaped[np.ndarray, "N"]]
 COLORS = ("red", "green", "blue")
 ORDER = {name: place for place, name in enumerate(("intensity", *COLORS))}
 INTENSITIES = ("intensity", "intensities", "i", "reflectance", "reflectivity", "remission")
-_ALIASES = dict.fromkeys(INTENSITIES, "intensity") | {
-    alias: colour for colour in COLORS for alias in (colour, colour[0], f"diffuse_{colour}")
-}
+_ALIASES = {alias: colour for colour in COLORS for alias in (colour, colour[0], f"diffuse_{colour}")}
+_ALIASES |= dict.fromkeys(INTENSITIES, "intensity")
 # Geometry, and what files say of a point besides its colour: by PCL, LAS, VeloView, Autoware, Livox and Ouster.
 _NOT_CHANNELS = re.compile(
     "[xyz_]|rgba?|a|(diffuse_)?alpha|n[xyz]|normal_[xyz]|curvature|vp_[xyz]|label|class|(raw_?)?classification|object|"

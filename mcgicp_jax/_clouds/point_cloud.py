@@ -69,7 +69,6 @@ PLANAR_ADVICE = (
 
 
 def _advice(shape: tuple[int, ...]) -> str:
-    """What to do with points of a wrong shape."""
     if len(shape) == 2 and shape[0] == 3:
         return "; pass points.T"
     if len(shape) == 3 and shape[2] == 3:
@@ -115,7 +114,6 @@ def _blank(channels: Any, channel_valid: Any) -> Any:
     return xp.where(channel_valid, channels, 0)
 
 
-@jax.tree_util.register_pytree_node_class
 @dataclass(frozen=True)
 class Voxels:
     """How a cloud was downsampled. An empty pytree, so that no program depends on it; copies that transformations of
@@ -129,16 +127,12 @@ class Voxels:
     size: float | None = None
     reason: str = ""
 
-    def tree_flatten(self) -> tuple[tuple[()], None]:
-        return (), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, __: tuple[()]) -> Voxels:
-        return cls()
-
     def __str__(self) -> str:
         because = f": {self.reason}" if self.reason else ""
         return "all points" if self.size is None else f"voxels of {self.size:g} m{because}"
+
+
+jax.tree_util.register_pytree_node(Voxels, lambda _: ((), None), lambda _, __: Voxels())
 
 
 def _default_names(count: int) -> tuple[str, ...]:
@@ -313,13 +307,8 @@ class PointCloud(eqx.Module):
             names = ", ".join(name for name in fields if name not in ("deferred_neighbors", "voxels"))
             advice = "; preprocess(cloud) finds neighbors" if "neighbors" in unknown else ""
             raise ValueError(f"replace: unknown field {', '.join(sorted(unknown))}; expected {names}{advice}")
-        shapes = {
-            "points": np.shape(self.points),
-            "valid": np.shape(self.valid),
-            "covariances": (*np.shape(self.points), 3),
-            "origin": np.shape(self.origin),
-            "times": np.shape(self.valid),
-        }
+        shapes = {name: np.shape(fields[name]) for name in ("points", "valid", "origin")}
+        shapes |= {"covariances": (*shapes["points"], 3), "times": shapes["valid"]}
         channels: Any = arrays.get("channels")
         for name in arrays.keys() & {"points", "channels", "covariances"}:
             if arrays[name] is not None:
@@ -407,17 +396,9 @@ class PointCloud(eqx.Module):
 
         points = copied(self.coordinates if np.any(self.origin) else self.points)
         # The constructor's checks hold already.
-        return self.replace_rows(
-            points=points,
-            channels=copied(self.channels),
-            channel_valid=copied(self.channel_valid),
-            valid=np.ones(len(points), bool),
-            deferred_neighbors=None,
-            covariances=copied(self.covariances),
-            origin=np.zeros(3),
-            voxels=Voxels(),
-            times=copied(self.times),
-        )
+        arrays = {name: copied(getattr(self, name)) for name in ("channels", "channel_valid", "covariances", "times")}
+        arrays |= {"points": points, "valid": np.ones(len(points), bool), "origin": np.zeros(3)}
+        return self.replace_rows(**arrays, deferred_neighbors=None, voxels=Voxels())
 
     def crop(self, min_range: float = 0.0, max_range: float = np.inf) -> PointCloud:
         """Return the valid points of a cloud in its sensor's frame whose distance from the sensor lies in a range, as a
@@ -467,15 +448,9 @@ class PointCloud(eqx.Module):
             grown[: len(array)], grown[len(array) :] = array, array[-1] if fill is None else fill
             return grown
 
-        return self.replace_rows(
-            points=grow(self.points),
-            channels=grow(self.channels),
-            channel_valid=grow(self.channel_valid, False),
-            valid=grow(self.valid, False),
-            deferred_neighbors=grow(self.neighbors, -1),
-            covariances=grow(self.covariances),
-            times=grow(self.times),
-        )
+        arrays = {name: grow(getattr(self, name)) for name in ("points", "channels", "covariances", "times")}
+        arrays |= {name: grow(getattr(self, name), False) for name in ("channel_valid", "valid")}
+        return self.replace_rows(**arrays, deferred_neighbors=grow(self.neighbors, -1))
 
     def replace_rows(self, **arrays: Any) -> PointCloud:
         """Replace fields without checks; the number of rows may change."""

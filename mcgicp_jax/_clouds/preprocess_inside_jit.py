@@ -43,10 +43,8 @@ def preprocess_traced(
         if size is None:
             raise ValueError("size: expected a number of rows with a voxel_size inside jit and vmap, got None")
         cloud = _averaged(cloud, float(edge), size)
-    return cloud.replace_rows(
-        deferred_neighbors=traced_neighbors(cloud, num_neighbors, search or default_search(traced=True)),
-        voxels=Voxels(edge),
-    )
+    neighbors = traced_neighbors(cloud, num_neighbors, search or default_search(traced=True))
+    return cloud.replace_rows(deferred_neighbors=neighbors, voxels=Voxels(edge))
 
 
 def traced_neighbors(cloud: PointCloud, num_neighbors: int, search: AbstractSearch) -> Int[Array, "N k"]:
@@ -89,14 +87,9 @@ def _averaged(cloud: PointCloud, voxel_size: float, size: int) -> PointCloud:
     measured = jnp.ones_like(channels, bool) if cloud.channel_valid is None else jnp.asarray(cloud.channel_valid)
     mean, occupied = means(points, jnp.broadcast_to(valid[:, None], points.shape))
     mean_channels, channel_valid = means(channels, measured & valid[:, None])
-    return _valid_first(
-        cloud.replace_rows(
-            points=mean,
-            channels=mean_channels,
-            channel_valid=None if cloud.channel_valid is None else channel_valid,
-            valid=occupied[:, 0] & (count <= size),
-        )
-    )
+    mask = None if cloud.channel_valid is None else channel_valid
+    valid = occupied[:, 0] & (count <= size)
+    return _valid_first(cloud.replace_rows(points=mean, channels=mean_channels, channel_valid=mask, valid=valid))
 
 
 def _voxels_of(

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
-from mcgicp_jax._clouds.voxels import starts_of, voxel_keys, voxel_of
+from mcgicp_jax._clouds.voxels import starts_of, voxel_keys
 from mcgicp_jax._compute.messages import check_concrete, check_positive, messages_named
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 
@@ -82,7 +82,7 @@ class VoxelMap:
         rows = np.hstack([np.ones((len(points), 1)), points, cloud.channels, measured])
         finite = np.isfinite(rows).all(axis=1)
         if self._first is None and finite.any():
-            self._first = voxel_of(points[finite][0], self._voxel_size)
+            self._first = np.floor(points[finite][0] / self._voxel_size)
         first = 0.0 if self._first is None else self._first
         with messages_named(name):
             point_keys = voxel_keys(points[finite], self._voxel_size, first)

@@ -73,8 +73,7 @@ class Shape(NamedTuple):
 
 
 def voxels_for(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> Voxels:
-    """The voxels for the raw clouds among those that are registered with each other. "auto" takes the voxels of the
-    first cloud that already has some."""
+    """The voxels for the raw clouds among these; "auto": those of the first preprocessed cloud, if there is one."""
     return voxels_and_grids(voxel_size, *clouds)[0]
 
 

@@ -21,19 +21,12 @@ VOXELS_PER_AXIS = 2**21
 TURN, VARIATION = np.pi / 3, 0.3
 
 
-def voxel_of(points: Float[np.ndarray, "*N 3"], voxel_size: float) -> Float[np.ndarray, "*N 3"]:
-    """Integer coordinates, as floats, of the voxels that contain the points."""
-    return np.floor(points / voxel_size)
-
-
 def voxel_keys(
     points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | float
 ) -> Int[np.ndarray, "N"]:
-    """Keys of the voxels that contain the points, counted from the voxel `first`.
-
-    Raises `ValueError` if a point lies 2²⁰ or more voxels from `first` along an axis.
-    """
-    cells = voxel_of(points, voxel_size) - first
+    """Keys of the voxels that contain the points, counted from the voxel `first`. Raises `ValueError` if a point lies
+    2²⁰ or more voxels from it along an axis."""
+    cells = np.floor(points / voxel_size) - first
     if np.abs(cells).max(initial=0) >= VOXELS_PER_AXIS // 2:
         worst = points[np.argmax(np.abs(cells).max(axis=1))]
         raise ValueError(
@@ -45,7 +38,7 @@ def voxel_keys(
 
 def wrapped_keys(points: Float[np.ndarray, "N 3"], voxel_size: float) -> Int[np.ndarray, "N"]:
     """Keys of the voxels that contain the points, modulo 2²¹ voxels along each axis."""
-    return _packed(np.mod(voxel_of(points, voxel_size), VOXELS_PER_AXIS))
+    return _packed(np.mod(np.floor(points / voxel_size), VOXELS_PER_AXIS))
 
 
 def _packed(cells: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
@@ -57,10 +50,8 @@ def _packed(cells: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
 def voxel_order(
     columns: Float[np.ndarray, "3 N"], voxel_size: float
 ) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
-    """An order that sorts points by voxel, and where each of the M occupied voxels starts in it.
-
-    Raises `ValueError` if the points extend over more than 2²¹ voxels along an axis.
-    """
+    """An order that sorts points by voxel, and where each of the M occupied voxels starts in it. Raises `ValueError` if
+    the points extend over more than 2²¹ voxels along an axis."""
     # Unlike in `voxel_keys`, the indices take no more bits than the extent of the points needs.
     key, num_keys = np.zeros(columns.shape[1], np.int64), 1
     for column in columns:

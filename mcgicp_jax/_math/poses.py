@@ -40,16 +40,11 @@ def pose_matrix(
 ) -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
     """The (4, 4) matrix of a pose: in float64 if the pose is concrete, in its own precision if it is traced.
 
-    The rotation of a concrete matrix is replaced by the nearest exact one, so that the pose does not scale the cloud.
+    A pose is a `jaxlie.SE3`, a (4, 4) matrix or its first three rows; None is the identity. The rotation of a concrete
+    matrix is replaced by the nearest exact one, so that the pose does not scale the cloud.
 
-    Args:
-        pose: `jaxlie.SE3`, (4, 4) matrix, or its first three rows; None is the identity.
-        name: name of the argument, for error messages.
-        distance: of the cloud to be moved from the origin, in radii of that cloud.
-
-    Raises:
-        ValueError: if the shape is wrong; for a concrete pose also if it is no rigid motion, or if its rotation has too
-            few digits for a cloud at that distance.
+    Raises `ValueError` for the argument `name` if the shape is wrong; for a concrete pose also if it is no rigid
+    motion, or if its rotation has too few digits for a cloud at this `distance` from the origin, in radii of the cloud.
     """
     if pose is None:
         return np.eye(4)

@@ -21,10 +21,8 @@ _BITS = np.uint64(0x9E3779B97F4A7C15)
 
 
 def sampled_rows(valid: Any, most: int = MEDIAN_ROWS) -> tuple[Any, Any]:
-    """At most so many evenly spaced rows of a cloud, such as the sample for a median; and which of them are valid.
-
-    `valid`, (N,), is False for padding, which comes last.
-    """
+    """At most `most` evenly spaced rows of a cloud, such as the sample for a median, and which of them are valid.
+    `valid` is (N,), False for padding, which comes last."""
     xp = numpy_for(valid)
     count = min(valid.size, most)
     rows = xp.arange(count) * (1 + xp.sum(valid) // most)

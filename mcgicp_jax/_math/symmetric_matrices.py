@@ -221,13 +221,10 @@ def sandwich(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float
     """W A W for symmetric 2×2 matrices."""
     p, q, r = outside
     a, b, c = inside
-    return jnp.stack(
-        [
-            p * p * a + 2 * p * q * b + q * q * c,
-            p * q * a + (p * r + q * q) * b + q * r * c,
-            q * q * a + 2 * q * r * b + r * r * c,
-        ]
-    )
+    xx = p * p * a + 2 * p * q * b + q * q * c
+    xy = p * q * a + (p * r + q * q) * b + q * r * c
+    yy = q * q * a + 2 * q * r * b + r * r * c
+    return jnp.stack([xx, xy, yy])
 
 
 def floor_eigenvalues(symmetric: Float[Array, "3 N"], floor: Float[Array, "*N"]) -> Float[Array, "3 N"]:
