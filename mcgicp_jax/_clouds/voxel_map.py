@@ -93,8 +93,7 @@ class VoxelMap:
         if len(starts):
             sums = np.add.reduceat(sums[order], starts, axis=0)
         if self._sums is None:
-            self._keys, self._sums = keys, sums
-            return
+            self._sums = np.zeros((0, sums.shape[1]))
         places = np.searchsorted(self._keys, keys)
         new = np.append(self._keys, -1)[places] != keys
         self._sums[places[~new]] += sums[~new]

@@ -22,10 +22,10 @@ _SIZES = range(3, 11)
 _PADDING = 1e-30
 
 
-def columns_of_floats(values: Float[np.ndarray, "n"], given: int | None = None) -> dict[str, Float[np.ndarray, "N"]]:
+def columns_of_floats(values: Float[np.ndarray, "n"], width: int | None = None) -> dict[str, Float[np.ndarray, "N"]]:
     """x, y, z and perhaps intensity, by the layout whose columns fit: KITTI (x, y, z, intensity), nuScenes (ring last),
-    ring and time last, PCL's points of 32 bytes (x, y, z, padding, intensity, padding), or x, y, z. Of a given number
-    of columns, the first are x, y, z, and the fourth is the intensity unless it has negative values. Raises
+    ring and time last, PCL's points of 32 bytes (x, y, z, padding, intensity, padding), or x, y, z. Of rows of a given
+    `width`, the first are x, y, z, and the fourth is the intensity unless it has negative values. Raises
     `ValueError` if none fits."""
 
     def split(size: int) -> Any:
@@ -34,18 +34,20 @@ def columns_of_floats(values: Float[np.ndarray, "n"], given: int | None = None) 
     def named(columns: Any, *others: int) -> dict[str, Float[np.ndarray, "N"]]:
         return dict(zip(("x", "y", "z", "intensity"), [*columns[:3], *(columns[i] for i in others)], strict=False))
 
-    columns = split(8) if given in (None, 8) else None
+    columns = split(8) if width in (None, 8) else None
     if columns is not None and _is_constant(columns[3]) and (np.abs(columns[5:]) < _PADDING).all():
         return named(columns, 4)
-    if given is not None:
-        columns = split(given)
+    if width is not None:
+        columns = split(width)
         if columns is None:
-            raise ValueError(f"expected rows of {given} float32 values, got {4 * values.size} bytes")
-        return named(columns, *([3] if given > 3 and _is_intensity(columns[3]) else []))
+            raise ValueError(f"expected rows of {width} float32 values, got {4 * values.size} bytes")
+        return named(columns, *([3] if width > 3 and _is_intensity(columns[3]) else []))
     for size in (6, 5):
         columns = split(size)
-        if columns is not None and _is_intensity(columns[3]) and _is_ring(columns[4]):
-            return named(columns, 3)
+        if columns is not None and _is_intensity(columns[3]) and not _is_constant(columns[4]):
+            ring = columns[4]
+            if ((ring == np.rint(ring)) & (ring >= 0) & (ring < _MOST_RINGS)).all():
+                return named(columns, 3)
     steps = {size: _step(values[:_SAMPLE], size) for size in (4, *_PERIODS)}
     columns = split(4)
     if columns is not None and _is_intensity(columns[3]) and min(steps.values()) >= _REPEATS * steps[4]:
@@ -74,9 +76,3 @@ def _is_constant(column: Float[np.ndarray, "N"]) -> bool:
 
 def _is_intensity(column: Float[np.ndarray, "N"]) -> bool:
     return not (column < 0).any()
-
-
-def _is_ring(column: Float[np.ndarray, "N"]) -> bool:
-    """Small whole numbers, not all the same."""
-    whole = (column == np.rint(column)) & (column >= 0) & (column < _MOST_RINGS)
-    return bool(whole.all()) and not _is_constant(column)

@@ -65,10 +65,10 @@ def _pcd_header(file: BinaryIO) -> list[str]:
     columns = {key: values for key, *values in map(str.split, lines)}
     counts = columns.setdefault("COUNT", ["1"] * len(columns.get("FIELDS", [])))
     # Fields without values take no place in the rows.
-    kept = [number for number, count in enumerate(counts) if count != "0"]
+    filled = [number for number, count in enumerate(counts) if count != "0"]
     for key in ("FIELDS", "SIZE", "TYPE", "COUNT"):
         if len(columns.get(key, [])) == len(counts):
-            columns[key] = [columns[key][number] for number in kept]
+            columns[key] = [columns[key][number] for number in filled]
     return [" ".join([key, *values]) for key, values in columns.items()]
 
 

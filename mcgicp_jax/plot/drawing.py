@@ -37,7 +37,6 @@ def new_figure(width: float | int, height: float | int) -> Figure:
 
 
 def saved(figure: Figure, path: File, **options: Any) -> Figure:
-    """The figure, saved to a file if `path` is one."""
     if path is not None:
         figure.savefig(path, dpi=120, **options)
     return figure

@@ -287,8 +287,7 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
         ImportError: if plotly is missing.
     """
     graphs = drawing.plotting("plotly.graph_objects")
-    if names is None:
-        names = [f"cloud {i}" for i in range(len(clouds))]
+    names = [f"cloud {i}" for i in range(len(clouds))] if names is None else names
     if len(names) != len(clouds):
         raise ValueError(f"names: expected {len(clouds)}, one per cloud, got {len(names)}")
     fraction = min(1.0, _MOST_POINTS / max(sum(len(cloud) for cloud in clouds), 1))
