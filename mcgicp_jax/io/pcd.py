@@ -22,7 +22,7 @@ def read_pcd(file: BinaryIO, size: int) -> PointCloud:
     metadata, start = pypcd4.MetaData.parse_header(_pcd_header(file)), file.tell()
     if metadata.points == 0:
         raise ValueError("it has no points")
-    num_bytes = metadata.points * sum(w * count for w, count in zip(metadata.size, metadata.count, strict=True))
+    num_bytes = metadata.points * sum(width * count for width, count in zip(metadata.size, metadata.count, strict=True))
     if metadata.data == pypcd4.Encoding.ASCII:
         check_size(2 * metadata.points * sum(metadata.count), size + 1)
         # pypcd4's own ASCII reader accepts only single spaces between numbers.
