@@ -34,9 +34,20 @@ _CELL_WIDTH, _CELL_HEIGHT, _COLUMNS, _ROWS = 0.84, 0.75, 4, 3
 _BORDER = 0.015
 _WALL_COLOR = np.array([0.72, 0.70, 0.66])
 # Colours away from 0 and 1, so that noise is rarely clipped.
-_RED_TO_TEAL = [[0.85, 0.20, 0.18], [0.93, 0.62, 0.15], [0.90, 0.85, 0.30], [0.25, 0.60, 0.30], [0.15, 0.55, 0.60]]
-_BLUE_TO_BROWN = [[0.16, 0.28, 0.62], [0.50, 0.25, 0.55], [0.90, 0.88, 0.84], [0.12, 0.12, 0.15], [0.55, 0.38, 0.25]]
-_PALETTE = np.array([*_RED_TO_TEAL, *_BLUE_TO_BROWN])
+_PALETTE = np.array(
+    [
+        [0.85, 0.20, 0.18],
+        [0.93, 0.62, 0.15],
+        [0.90, 0.85, 0.30],
+        [0.25, 0.60, 0.30],
+        [0.15, 0.55, 0.60],
+        [0.16, 0.28, 0.62],
+        [0.50, 0.25, 0.55],
+        [0.90, 0.88, 0.84],
+        [0.12, 0.12, 0.15],
+        [0.55, 0.38, 0.25],
+    ]
+)
 
 # Metres to the right and downwards along the wall.
 Offset: TypeAlias = Float[np.ndarray, "2"]
