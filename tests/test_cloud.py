@@ -126,6 +126,7 @@ def test_unpad_undoes_pad(size):
     for cloud in (raw(covariances=covariances(), channel_valid=partial()), ready()):
         assert_same(cloud.pad(size + 10).unpad(), cloud.unpad())
         assert cloud.pad(size + 10).points.shape == (size + 10, 3) and len(cloud.pad(size + 10)) == 150
+    refused(PointCloud.stack([ready()] * 2).unpad, "points", "(2, 192, 3)")
     unpadded = ready().unpad()
     np.testing.assert_array_equal(unpadded.points, POINTS)
     np.testing.assert_array_equal(unpadded.covariances, covariances())

@@ -1,5 +1,7 @@
 """Brute force on the device: the tree's answers, and a whole batch as one program, on one device or several."""
 
+import itertools
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -243,7 +245,7 @@ def test_pairs_of_shapes_that_the_method_refuses(raw):
 def test_a_bad_pair_spoils_no_other(clouds):
     expected = in_chunks(*clouds)
     sources, targets = (list(side) for side in clouds)
-    sources[0], targets[4] = np.zeros((3, 3)), np.full((9, 3), np.nan)
+    sources[0], targets[4] = np.array(5.0), np.full((9, 3), np.nan)
     starts = [None, motion((100.0, 0, 0, 0, 0, 0)), None, None, None, None]
     with pytest.warns(UserWarning, match="pair [04]"):
         results = in_chunks(sources, targets, init=starts)
@@ -304,6 +306,23 @@ def test_a_stream_yields_invalid_pairs_and_those_of_many_updates_on_the_way(clou
     assert max(list(ended).index(number) for number in (0, 2)) < 40
 
 
+def test_pairs_that_nobody_waits_for_are_not_prepared(clouds, monkeypatch):
+    prepared_pair, indices = BatchJob._chunk_pair, []
+
+    def slowly(job, pair):
+        indices.append(pair.index)
+        time.sleep(0.02)
+        return prepared_pair(job, pair)
+
+    monkeypatch.setattr(BatchJob, "_chunk_pair", slowly)
+    endless = (itertools.repeat(side[0]) for side in clouds)
+    completed = mcg.register_as_completed(*endless, UNSET, max_distance=0.5, search=DenseSearch())
+    next(completed)
+    count = len(indices)
+    completed.close()
+    assert len(indices) <= count + 1
+
+
 def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     monkeypatch.setattr(chunks, "_PATIENCE", 2)
     # 490 points fill the larger size class, the others the smaller, whose pairs do not come first: they would join.
@@ -352,6 +371,13 @@ def test_several_neighbours_are_those_of_trees(size):
     """More than 2,560 points are sought in two steps."""
     points = np.random.default_rng(0).normal(size=(size, 3)).astype(float if jax.enable_x64.value else np.float32)
     np.testing.assert_array_equal(DenseSearch().neighbors(points, 20), KDTreeSearch().neighbors(points, 20))
+
+
+@pytest.mark.parametrize("num_candidates", [1, 3])
+def test_no_row_finds_nothing(num_candidates):
+    nothing, here = rows(np.zeros((0, 3))), jnp.array([1, 0, 0, 0, 0, 0, 0], jnp.float32)
+    arguments = here, nothing, rows(np.zeros((20, 3))), jnp.float32(1), jnp.array(True), num_candidates
+    assert DenseSearch().nearest_traced(*arguments).shape == (num_candidates, 0)
 
 
 def test_a_row_that_is_not_a_number_hides_no_others():

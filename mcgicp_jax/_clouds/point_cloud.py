@@ -394,8 +394,10 @@ class PointCloud(eqx.Module):
             # A plain copy takes a tenth of the time of boolean indexing.
             return np.array(array) if all_valid else np.asarray(array)[valid]
 
+        if self.points.ndim != 2:
+            raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")
         points = copied(self.coordinates if np.any(self.origin) else self.points)
-        # The constructor's checks hold already.
+        # The constructor's other checks hold already.
         arrays = {name: copied(getattr(self, name)) for name in ("channels", "channel_valid", "covariances", "times")}
         arrays |= {"points": points, "valid": np.ones(len(points), bool), "origin": np.zeros(3)}
         return self.replace_rows(**arrays, deferred_neighbors=None, voxels=Voxels())

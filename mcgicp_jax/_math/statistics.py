@@ -96,7 +96,8 @@ def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, "
 
 
 def upper_median(values: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch"]:
-    """The value at half of the count in order: for a few values, NumPy's median takes three times as long."""
+    """The median, or of an even number of values the larger one of the two in the middle. For a few values, NumPy's
+    median takes three times as long."""
     middle = values.shape[-1] // 2
     return np.partition(values, middle)[..., middle]
 

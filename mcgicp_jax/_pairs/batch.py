@@ -80,9 +80,9 @@ def register_as_completed(
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
     """Register many pairs of clouds of any sizes and yield each result as soon as it is computed.
 
-    Pairs are independent: a result is the same for any other pairs, any order and any number of workers, bitwise on a
-    CPU and to rounding on accelerators, and a slow pair does not delay others. Invalid pairs (too few finite points,
-    mismatched channels, unreadable file, a function that raises) get the status `INVALID_INPUT` and a warning.
+    Pairs are independent: a result is the same for any other pairs, any order and any number of workers, bitwise with
+    trees and to rounding with `DenseSearch`, and a slow pair does not delay others. Invalid pairs (too few finite
+    points, mismatched channels, unreadable file, a function that raises) get the status `INVALID_INPUT` and a warning.
     Iterators are consumed lazily.
 
     Args:
@@ -107,9 +107,10 @@ def register_as_completed(
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not
             with an `executor`, `priors`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
-            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points. Only the first
-            eight pairs are looked at for warnings of neighbourhoods and units. Pairs that may have left a right initial
-            pose, see `register`, are registered again on the CPU.
+            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points, but not for those
+            that fill half of an earlier one. Only the first eight pairs are looked at for warnings of neighbourhoods,
+            units and patterns in channels. Pairs that may have left a right initial pose, see `register`, are
+            registered again on the CPU.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import functools
 import traceback
 import warnings
@@ -43,7 +44,7 @@ from mcgicp_jax._registration.register_pair import (
     preprocessed,
     results_of,
     run_pair,
-    with_textures,
+    without_sensor_patterns,
 )
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unknown_uncertainty, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, checked_measurements
@@ -161,8 +162,8 @@ def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
 class BatchJob:
     """The settings common to all pairs, and the work on one pair or on several.
 
-    `checked`: whether to look at neighbourhoods, units and patterns in channels, for warnings; chunks look for patterns
-    anyway.
+    `checked`: whether to look at neighbourhoods, units and patterns in channels, and warn. (Patterns are left out in
+    any case; chunks find them on the device.)
     """
 
     method: AbstractMethod
@@ -280,7 +281,7 @@ class BatchJob:
     def _register_prepared(self, pair: PreparedPair) -> PairResult:
         """The result of a pair alone."""
         if self.method.uses_channels:
-            source, target = with_textures(*pair.inputs[:2], self.method)
+            source, target = without_sensor_patterns(*pair.inputs[:2], self.method)
             pair = replace(pair, inputs=pair.inputs._replace(source=source, target=target))
         run = self._run(pair)
         if isinstance(run, PairResult):
@@ -289,14 +290,14 @@ class BatchJob:
         return self._result(pair.index, pair.checked(result))
 
     def register_in_chunks(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
-        """Register the pairs in chunks on this machine; threads preprocess them, and register those again that may have
-        left a right initial pose."""
+        """Register the pairs in chunks on this machine. One thread prepares those of small clouds, several the others;
+        these also register pairs again that may have left a right initial pose."""
         # On the host neighbours are needed for warnings alone, of a sample of points.
         on_host = replace(self, options=replace(self.options, search=default_search(workers=1)))
         unchecked = replace(on_host, checked=False)
         search, most = self.options.search or DenseSearch(), self.options.max_source_points
         pool = partial(ThreadPoolExecutor, thread_name_prefix="mcgicp")
-        with pool(1) as one, pool(num_threads) as threads:
+        with _cancelled(pool(1)) as one, _cancelled(pool(num_threads)) as threads:
             rejected: list[PairResult] = []
             again: collections.deque[Future[PairResult]] = collections.deque()
             register = with_settings(on_host._register_prepared)
@@ -364,9 +365,20 @@ class BatchJob:
         return PairResult(index, computed(result))
 
 
-def _size(cloud: Cloud) -> int:
-    """The number of rows of a cloud or array; 0 of what is still to be read."""
-    return getattr(cloud.points if isinstance(cloud, PointCloud) else cloud, "shape", (0,))[-2:][0]
+@contextlib.contextmanager
+def _cancelled(threads: ThreadPoolExecutor) -> Iterator[ThreadPoolExecutor]:
+    """Context of an executor whose waiting calls do not begin once it is left, be it by an error or an early end."""
+    try:
+        yield threads
+    finally:
+        threads.shutdown(cancel_futures=True)
+
+
+def _is_small(pair: Pair) -> bool:
+    """Whether the pair is quickly prepared: arrays, not what is still to be read, and a pose that need not be found."""
+    arrays = (cloud.points if isinstance(cloud, PointCloud) else cloud for cloud in (pair.source, pair.target))
+    shapes = [array.shape if isinstance(array, np.ndarray | jax.Array) else () for array in arrays]
+    return not isinstance(pair.init, str) and all(0 < len(shape) <= 2 and shape[0] <= _SMALL for shape in shapes)
 
 
 def _invalid(index: int, error: ValueError) -> PairResult:
@@ -398,14 +410,14 @@ def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
 
 
 def _computed_ahead(
-    function: Callable[[Pair], Any], pairs: Iterable[Pair], one: Executor, threads: Executor, count: int
+    function: Callable[[Pair], Any], pairs: Iterable[Pair], for_small: Executor, for_others: Executor, count: int
 ) -> Iterator[Any]:
-    """Yield `function(pair)` in order: of small clouds from the executor `one`, with at most `_SMALL_AHEAD` calls
-    computed ahead; of others from `threads`, with at most `count`."""
+    """Yield `function(pair)` in order, with at most `_SMALL_AHEAD` calls computed ahead where pairs are small, else
+    `count`."""
     futures: collections.deque[Future[Any]] = collections.deque()
     for pair in pairs:
-        small = all(0 < _size(cloud) <= _SMALL for cloud in (pair.source, pair.target))
-        futures.append((one if small else threads).submit(function, pair))
+        small = _is_small(pair)
+        futures.append((for_small if small else for_others).submit(function, pair))
         while len(futures) > (_SMALL_AHEAD if small else count):
             yield futures.popleft().result()
     while futures:

@@ -29,7 +29,7 @@ from mcgicp_jax._registration.assessment import Assessment
 from mcgicp_jax._registration.loop import Record, State
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
-from mcgicp_jax._registration.register_pair import problem_of, with_textures
+from mcgicp_jax._registration.register_pair import problem_of, without_sensor_patterns
 from mcgicp_jax._registration.start_check import doubt_of_start, surface_fit
 from mcgicp_jax._registration.traced import TracedExecutor, assess
 from mcgicp_jax._search.base import AbstractSearch
@@ -248,7 +248,8 @@ def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
 
 
 def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
-    """The pair padded to the smallest of the sizes whose rows it fills by half or more; else its own are added."""
+    """The pair, padded to the smallest of the `sizes` of earlier ones whose rows it fills by half or more. Without one
+    it stays as it is, and its own size joins them."""
     own = pair.source.valid.size, pair.target.valid.size
     if own in sizes:
         return pair
@@ -289,7 +290,7 @@ def _registered(
         own = replace(options, **numbers | {"max_coarse_distance": pair.max_coarse_distance})
         source, target = pair.source, pair.target
         if method.uses_channels:
-            source, target = with_textures(source, target, method)
+            source, target = without_sensor_patterns(source, target, method)
         problem, inputs = problem_of(Inputs(source, target, method, robust), None, own, 1)
         problem = replace(problem, start=pair.start)
         executor = TracedExecutor(problem, search, options.max_iterations)

@@ -151,15 +151,15 @@ def prepared(
     prior: GivenPrior | None = None,
     channels_checked: bool = True,
 ) -> Inputs:
-    """The arguments of a registration, checked; and the clouds, see `preprocessed`, by `with_textures` if
-    `channels_checked`."""
+    """The arguments of a registration, checked, with clouds that are `preprocessed`, and if `channels_checked`,
+    `without_sensor_patterns`."""
     check_method(method)
     sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
     source, target = preprocessed(sides, method, options)
     if options.soft_matches is False:
         warn_of_hard_matches(method, source, target)
     if channels_checked and method.uses_channels:
-        source, target = with_textures(source, target, method)
+        source, target = without_sensor_patterns(source, target, method)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and not is_concrete(primal((source, target))):
@@ -172,7 +172,9 @@ def prepared(
     return Inputs(source, target, method, options.robust, *checked_measurements(tie_points, prior, source, target))
 
 
-def with_textures(source: PointCloud, target: PointCloud, method: AbstractMethod) -> tuple[PointCloud, PointCloud]:
+def without_sensor_patterns(
+    source: PointCloud, target: PointCloud, method: AbstractMethod
+) -> tuple[PointCloud, PointCloud]:
     """The clouds for a method that uses channels, without what moves with the sensor."""
     source, target = without_patterns(source, target)
     if isinstance(method, MultiChannelGICP) and method.photometric:

@@ -20,13 +20,13 @@ from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, Sea
 from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 # Coordinates and descriptors of rows, each with its penalties.
-Columns: TypeAlias = list[tuple[Array, Array | None]]
+Coordinates: TypeAlias = list[tuple[Array, Array | None]]
 # Rows of a run. Of a run the nearest row alone is stored: a sixteenth of the table of distances.
 _RUN = 16
-# Columns of a group: on an H200, to sort all of 384 columns, and then 320, took 0.15 ms for a cloud of 6,144 rows, as
-# long as the rest of its preparation and registration.
+# Numbers of a group, among which the smallest are found by groups. On an H200, to sort the 384 runs of a cloud of 6,144
+# rows, and then the 320 rows of 20 runs, for each row, took as long as the rest of its preparation and registration.
 _GROUP = 4
-# Entries of that table that are stored at a time: 64 MB in float32, all queries of clouds of 16,384 rows.
+# Distances to runs that are stored at a time: 64 MB in float32, those of all queries of clouds of 16,384 rows.
 _STORED = 2**24
 
 
@@ -99,29 +99,29 @@ def _nearest(
     """
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     moved = jnp.dot(source.points, rotation.T, precision="highest") + pose[4:]
-    queries, columns = _columns(source._replace(points=moved)), _columns(target)
+    queries, targets = _coordinates(source._replace(points=moved)), _coordinates(target)
     # Rows to ignore are infinitely far. One with NaN would be nearest.
-    valid = target.valid & ~jnp.isnan(sum(value for value, _ in columns))
-    columns = [(jnp.where(valid, value, jnp.inf), penalty) for value, penalty in columns]
-    blocks = _in_blocks(columns, _RUN, jnp.inf)
-    num_runs = len(blocks[0][0])
+    valid = target.valid & ~jnp.isnan(sum(value for value, _ in targets))
+    targets = [(jnp.where(valid, value, jnp.inf), penalty) for value, penalty in targets]
+    targets = _in_blocks(targets, _RUN, jnp.inf)
+    num_runs = len(targets[0][0])
     # With the compiler's own choice of layout, GPUs would read the rows of a run far apart.
-    by_row = jax.lax.optimization_barrier(jax.tree.map(jnp.transpose, blocks))
+    by_row = jax.lax.optimization_barrier(jax.tree.map(jnp.transpose, targets))
 
-    def nearest(queries: Columns) -> Int[Array, "m n"]:
+    def nearest(queries: Coordinates) -> Int[Array, "m n"]:
         # Written out: on GPUs a reduction over so few rows takes several times as long.
         of_rows = (_squares(_at(queries, np.s_[:, None]), _at(by_row, row)) for row in range(_RUN))
         # In the order of rows, by which ties are broken.
         runs = jnp.sort(_smallest(functools.reduce(jnp.minimum, of_rows), num_candidates), axis=1)
-        rows = (runs[:, :, None] * _RUN + jnp.arange(_RUN)).reshape(len(runs), -1)
-        squares = _squares(_at(queries, np.s_[:, None, None]), _at(blocks, runs)).reshape(rows.shape)
+        rows = (runs[:, :, None] * _RUN + jnp.arange(_RUN)).reshape(len(runs), runs.shape[1] * _RUN)
+        squares = _squares(_at(queries, np.s_[:, None, None]), _at(targets, runs)).reshape(rows.shape)
         first = _smallest(squares, num_candidates)
         square, row = (jnp.take_along_axis(table, first, axis=1) for table in (squares, rows))
         found = jnp.where(jnp.isfinite(square), row, -1).astype(jnp.int32)
         return jnp.pad(found, [(0, 0), (0, num_candidates - found.shape[1])], constant_values=-1).T
 
     count = source.valid.size
-    block = max(1, _STORED // max(num_runs, num_candidates * _RUN * len(columns)))
+    block = max(1, _STORED // max(num_runs, num_candidates * _RUN * len(targets)))
     if count <= block:
         rows = nearest(queries)
     else:
@@ -129,25 +129,25 @@ def _nearest(
     return jnp.where(source.valid, rows[:, :count], -1)
 
 
-def _columns(rows: SearchPoints) -> Columns:
+def _coordinates(rows: SearchPoints) -> Coordinates:
     """The coordinates and descriptors of rows, each with the penalties for missing ones."""
     values = [*rows.points.T, *rows.descriptors.T]
     penalties = [None] * len(values) if rows.penalty is None else [None, None, None, *rows.penalty.T]
     return list(zip(values, penalties, strict=True))
 
 
-def _in_blocks(columns: Columns, size: int, last: float) -> Columns:
-    """Columns as (n, size); the value `last` fills up the last block."""
+def _in_blocks(rows: Coordinates, size: int, last: float) -> Coordinates:
+    """Coordinates as (n, size); the value `last` fills up the last block."""
     return jax.tree.map(
-        lambda column: jnp.pad(column, (0, -column.size % size), constant_values=last).reshape(-1, size), columns
+        lambda values: jnp.pad(values, (0, -values.size % size), constant_values=last).reshape(-1, size), rows
     )
 
 
-def _at(columns: Columns, index: Any) -> Columns:
-    return jax.tree.map(lambda column: column[index], columns)
+def _at(rows: Coordinates, index: Any) -> Coordinates:
+    return jax.tree.map(lambda values: values[index], rows)
 
 
-def _squares(queries: Columns, targets: Columns) -> Float[Array, "*rows"]:
+def _squares(queries: Coordinates, targets: Coordinates) -> Float[Array, "*rows"]:
     """Squared search distances, metres², of rows whose axes broadcast."""
     squares = []
     for (query, query_penalty), (target, target_penalty) in zip(queries, targets, strict=True):
@@ -159,17 +159,17 @@ def _squares(queries: Columns, targets: Columns) -> Float[Array, "*rows"]:
     return sum(squares[1:], squares[0])
 
 
-def _smallest(squares: Float[Array, "N M"], count: int) -> Int[Array, "N m"]:
-    """Columns of the smallest squares of each row, ties by column."""
-    size = squares.shape[1]
+def _smallest(numbers: Float[Array, "N M"], count: int) -> Int[Array, "N m"]:
+    """Places of the smallest numbers of each row, ties by place."""
+    size = numbers.shape[1]
     if count == 1:
-        return jnp.argmin(squares, axis=1, keepdims=True)
+        return jnp.argmin(numbers, axis=1, keepdims=True)
     if size <= 2 * _GROUP * count:
-        return jax.lax.top_k(-squares, min(count, size))[1]
-    # Among the columns of the groups whose smallest square is smallest.
-    squares = jnp.pad(squares, ((0, 0), (0, -size % _GROUP)), constant_values=jnp.inf)
-    least = functools.reduce(jnp.minimum, (squares[:, column::_GROUP] for column in range(_GROUP)))
+        return jax.lax.top_k(-numbers, min(count, size))[1]
+    # In those groups whose smallest numbers are smallest, for the same reason as in runs.
+    numbers = jnp.pad(numbers, ((0, 0), (0, -size % _GROUP)), constant_values=jnp.inf)
+    least = functools.reduce(jnp.minimum, (numbers[:, place::_GROUP] for place in range(_GROUP)))
     groups = jnp.sort(_smallest(least, count), axis=1)
-    columns = (groups[:, :, None] * _GROUP + jnp.arange(_GROUP)).reshape(len(squares), -1)
-    nearest = _smallest(jnp.take_along_axis(squares, columns, axis=1), count)
-    return jnp.take_along_axis(columns, nearest, axis=1)
+    places = (groups[:, :, None] * _GROUP + jnp.arange(_GROUP)).reshape(len(numbers), count * _GROUP)
+    smallest = _smallest(jnp.take_along_axis(numbers, places, axis=1), count)
+    return jnp.take_along_axis(places, smallest, axis=1)
