@@ -96,13 +96,14 @@ def register_as_completed(
             with priors run on the CPU. With an `executor`, the poses have no derivatives by them.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
             for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
-        executor: None: threads, one per core, and once the time that processes would save is 1.5 times their start,
-            these; the logger `mcgicp_jax` says so (INFO). Functions that return clouds then run there, on copies of
-            what they refer to. "threads"; "processes", one per core, which need no `__main__` guard, start in 3 to
-            16 s, and wait for further calls until this process ends; or any `concurrent.futures.Executor`, such as
-            Dask's `Client.get_executor()`. A pair whose worker dies is sent once more, and gets the status
-            `WORKER_FAILED` and a warning if that fails too.
-        covariances: False saves a tenth of the time: `covariance` and `deviations` are NaN.
+        executor: None: threads, one per core, until the time that processes would save on the other pairs is 1.5 times
+            that of their start; then these. The logger `mcgicp_jax` says so (INFO). Functions that return clouds then
+            run there, on copies of what they refer to. "threads"; "processes", one per core, which need no `__main__`
+            guard, start in 3 to 16 s, and wait for further calls until this process ends; or any
+            `concurrent.futures.Executor`, such as Dask's `Client.get_executor()`. A pair whose worker dies is sent once
+            more, and gets the status `WORKER_FAILED` and a warning if that fails too.
+        covariances: False saves a tenth of the time, and on accelerators a third of the compilation: `covariance` and
+            `deviations` are NaN.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not

@@ -71,7 +71,8 @@ def register(
     neighbours and estimated parameters are constants. Since channels act mostly by the matches, and α by them alone,
     these are several candidates per point whose weights have derivatives: see `soft_matches`.
     Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
-    If registration fails otherwise, the derivative is 0, never NaN, except after MAX_ITERATIONS or if UNVERIFIED.
+    UNVERIFIED poses, and those after MAX_ITERATIONS, have a derivative as if they had converged. After other failures
+    it is 0, never NaN.
     Outside `jit`, value and gradient take two to five registrations, for clouds of any size; inside, each size compiles
     for some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
 
