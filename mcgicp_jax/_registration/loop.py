@@ -363,7 +363,7 @@ def update(
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
         (settled & degenerate, Status.DEGENERATE),
-        (settled & (_contradicts_prior(pose, measurements) | doubtful), Status.UNVERIFIED),
+        (settled & (contradicts_prior(pose, measurements) | doubtful), Status.UNVERIFIED),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (coarse & ~converged, COARSE),
@@ -391,7 +391,7 @@ def _depends_on_channels(directions: Directions | None) -> Bool[AnyScalar, ""]:
     return np.bool_(False) if directions is None else jnp.any(directions.constrained_by_channels)
 
 
-def _contradicts_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Bool[AnyScalar, ""]:
+def contradicts_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Bool[AnyScalar, ""]:
     """Whether a pose that is the result is much further from the prior than its covariance allows."""
     if not isinstance(measurements, Fusion):
         return np.bool_(False)

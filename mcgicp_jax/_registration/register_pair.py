@@ -50,7 +50,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_hard_matches,
     warn_of_inputs,
 )
-from mcgicp_jax._registration.loop import LoopResult, Problem, State
+from mcgicp_jax._registration.loop import LoopResult, Problem, State, contradicts_prior
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
@@ -213,26 +213,29 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
         run = solve(again, _final_pose(run), replace(options, max_coarse_distance=0.0))
     elif not traced and given.method.uses_channels and not options.equalize_channels:
-        if run.loop.state.status == Status.UNVERIFIED and run.problem.settings.channels_may_move:
-            warn_of_patterns(run.inputs.source)
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
-    if not measures:
-        if not traced and run.loop.state.status == Status.DEGENERATE and run.loop.state.directions is not None:
-            _warn_of_near_points(run)
-        if doubt and run.loop.state.status == Status.CONVERGED:
-            warn(f'{doubt}; the pose is UNVERIFIED. Try a better init, or init="global"')
-            state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
-            run = run._replace(loop=run.loop._replace(state=state), state=lambda: state)
+    if measures:
+        # Again from its pose, with tie points and prior weighed by its covariance.
+        fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
+        settings = run.problem.settings
+        if options.max_distance is None:
+            settings = settings._replace(max_distance=settings.fine_distance)
+        problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
+        run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
+    if traced:
         return run
-    # Again from its pose, with tie points and prior weighed by its covariance.
-    fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
-    settings = run.problem.settings
-    if options.max_distance is None:
-        settings = settings._replace(max_distance=settings.fine_distance)
-    problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
-    run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
-    if not traced and run.loop.state.status == Status.UNVERIFIED and not settings.channels_may_move:
-        warn("prior: the pose contradicts it by more than its covariance allows, and is UNVERIFIED")
+    status = run.loop.state.status
+    if status == Status.UNVERIFIED:
+        if contradicts_prior(run.loop.state.pose, run.problem.measurements):
+            warn("prior: the pose contradicts it by more than its covariance allows, and is UNVERIFIED")
+        else:
+            warn_of_patterns(run.inputs.source)
+    elif not measures and status == Status.DEGENERATE and run.loop.state.directions is not None:
+        _warn_of_near_points(run)
+    elif not measures and status == Status.CONVERGED and doubt:
+        warn(f'{doubt}; the pose is UNVERIFIED. Try a better init, or init="global"')
+        state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
+        run = run._replace(loop=run.loop._replace(state=state), state=lambda: state)
     return run
 
 
