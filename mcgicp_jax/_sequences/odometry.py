@@ -161,9 +161,16 @@ def odometry(
         raise ValueError("hold_unconstrained: expected True with priors, got False")
     remaining_priors = None if priors is None else iter(priors)
     reader = _Reader(enumerate(frames), method, settings, voxel_size, num_neighbors, deskew, remaining_priors)
-    motion, pose = pose_matrix(init), np.asarray(pose_matrix(start, "start"))
-    in_hindsight = deskew and init is None
-    return _Sensor(reader, against == "map", map_radius, recover, loops, in_hindsight, pose, motion, motion)
+    return _Sensor(
+        reader,
+        against_map=against == "map",
+        radius=map_radius,
+        recover=recover,
+        loops=loops,
+        in_hindsight=deskew and init is None,
+        pose=np.asarray(pose_matrix(start, "start")),
+        motion=pose_matrix(init),
+    )
 
 
 @dataclass
@@ -222,9 +229,8 @@ class _Sensor(Iterator[OdometryStep]):
     in_hindsight: bool
     # Sensor to world.
     pose: Float[np.ndarray, "4 4"]
-    # Motion between the last two frames, and motion by which the next scan is first deskewed.
+    # Motion between the last two frames.
     motion: Any
-    scan_motion: Any
     first: tuple[str, PointCloud] | None = None
     # The last frame, None before the first.
     cloud: PointCloud | None = None
@@ -236,6 +242,8 @@ class _Sensor(Iterator[OdometryStep]):
 
     def __post_init__(self) -> None:
         self.frames, self.method, self.options = ReadAhead(self.reader), self.reader.method, self.reader.options
+        # Motion by which the next scan is first deskewed.
+        self.scan_motion = self.motion
         # Registrations of the last two steps.
         self.unread: collections.deque[Any] = collections.deque(maxlen=2)
 
