@@ -30,7 +30,7 @@ _SAMPLE = 10_000
 
 def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = None) -> Bool[np.ndarray, "N"]:
     """Which valid and finite points of a concrete cloud are measurements. Of points at (0, 0, 0), where a sensor may
-    be, only the first is one. `complete`: rows to consider; None: all valid ones."""
+    be, only the first is one. `complete`: rows to consider, all finite; None: the valid ones."""
     points, finite = np.asarray(cloud.points), np.asarray(cloud.valid) if complete is None else complete
     # One check of all values is much faster than one per row.
     if complete is None and not (np.abs(points) <= LARGEST).all():

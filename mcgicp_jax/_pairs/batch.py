@@ -102,8 +102,8 @@ def register_as_completed(
             guard, start in 3 to 16 s, and wait for further calls until this process ends; or any
             `concurrent.futures.Executor`, such as Dask's `Client.get_executor()`. A pair whose worker dies is sent once
             more, and gets the status `WORKER_FAILED` and a warning if that fails too.
-        covariances: False saves a tenth of the time, and on accelerators a third of the compilation: `covariance` and
-            `deviations` are NaN.
+        covariances: False saves a tenth of the time, and compilation on accelerators: `covariance` and `deviations` are
+            NaN.
         options: options of `register`, except for `tie_points` and `prior`. `search` is also used to preprocess; by
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not
