@@ -78,15 +78,14 @@ def channels_may_move(source: PointCloud) -> Bool[AnyScalar, ""]:
     return ((by_angles > _NO_TEXTURE) | (smooth > _NO_TEXTURE)).all()
 
 
-def warn_of_patterns(source: PointCloud) -> None:
-    """Warn that a pose is UNVERIFIED because no channel of a concrete cloud, constant ones apart, is a texture."""
+def doubt_of_patterns(source: PointCloud) -> str:
+    """That a pose is UNVERIFIED because no channel of a concrete cloud, constant ones apart, is a texture."""
     largest = [max(both) for both in zip(*explained(source), strict=True)]
     shares = [f"{share:.0%} of {name}" for name, share in zip(source.channel_names, largest, strict=True) if share < 1]
-    if shares:
-        warn(
-            f"channels: a smooth function of position, or one of range, elevation or azimuth, explains "
-            f"{', '.join(shares)} (variance); such channels may move with the sensor, and the pose is UNVERIFIED"
-        )
+    return (
+        f"channels: a smooth function of position, or one of range, elevation or azimuth, explains "
+        f"{', '.join(shares) or 'them'} (variance); such channels may move with the sensor, and the pose is UNVERIFIED"
+    )
 
 
 def without_patterns(source: PointCloud, target: PointCloud) -> list[PointCloud]:

@@ -25,9 +25,10 @@ from mcgicp_jax._compute.devices import computed_on_cpu, on_accelerator
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
+from mcgicp_jax._local_geometry.sensor_patterns import doubt_of_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.register import coarse_distance_from, doubt_of, register_from, start_from_anywhere
+from mcgicp_jax._pairs.register import coarse_distance_from, doubt_of, doubt_of_start_pose, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.chunks import ChunkPair, Refused, run_pairs
 from mcgicp_jax._registration.input_checks import (
@@ -93,7 +94,7 @@ class PairResult:
     """The result of one pair.
 
     Attributes:
-        reason: why it has no pose; None if it has one, or the status is the reason.
+        reason: why it has no pose, or one that is UNVERIFIED; None if it has a pose, or the status is the reason.
         warnings: issued in another process.
         jacobian: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`.
     """
@@ -118,7 +119,7 @@ class PairResult:
 
 @dataclass(frozen=True)
 class PreparedPair:
-    """A pair of preprocessed clouds; `verified` unless the initial pose is one that `global_pose` doubts.
+    """A pair of preprocessed clouds; `doubt` says why the pose that `global_pose` found is doubtful, or nothing.
 
     `max_coarse_distance` is that of `Options`; `prior` is that of the `Pair`.
     """
@@ -127,7 +128,7 @@ class PreparedPair:
     inputs: Inputs
     init: Pose | None
     prior: GivenPrior | None = None
-    verified: bool = True
+    doubt: str = ""
     max_coarse_distance: float = np.inf
 
     @property
@@ -142,7 +143,7 @@ class PreparedPair:
 
     def checked(self, result: RegistrationResult) -> RegistrationResult:
         """The result, UNVERIFIED if the initial pose is, or the overlap is small."""
-        return verified(result, self.verified)
+        return verified(result, not self.doubt)
 
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
@@ -215,7 +216,7 @@ class BatchJob:
         if start is None:
             return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
         distance = coarse_distance_from(start, self.options)
-        return PreparedPair(pair.index, inputs, start.matrix, pair.prior, start.success, distance)
+        return PreparedPair(pair.index, inputs, start.matrix, pair.prior, doubt_of_start_pose(start), distance)
 
     @computed_on_cpu
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
@@ -234,9 +235,8 @@ class BatchJob:
 
     @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
-        source, target = self._clouds(pair)
-        given = source, target, self.method, pair.init, self._options
-        return self._result(pair.index, register_from(*given, prior=pair.prior))
+        ready = self.prepare(pair)
+        return ready if isinstance(ready, PairResult) else self._register_prepared(ready)
 
     @_of_a_pair
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
@@ -256,7 +256,7 @@ class BatchJob:
 
         parameters, vjp = jax.vjp(pose, *(leaves[i] for i in pair.traced))
         blocks = jax.vmap(vjp)(jnp.eye(7, dtype=parameters.dtype))
-        return replace(self._result(pair.index, result), jacobian=tuple(map(np.asarray, blocks)))
+        return replace(self._result(pair.index, result, run.doubt), jacobian=tuple(map(np.asarray, blocks)))
 
     def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
         """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""
@@ -269,7 +269,8 @@ class BatchJob:
         ended = [pair for pair in ready if isinstance(outcomes[pair.index], Run)]
         results = results_of([outcomes[pair.index] for pair in ended], [pair.inputs for pair in ended])
         for pair, result in zip(ended, results, strict=True):
-            outcomes[pair.index] = PairResult(pair.index, pair.checked(result))
+            reason = pair.doubt or outcomes[pair.index].doubt or None
+            outcomes[pair.index] = PairResult(pair.index, pair.checked(result), reason)
         return [outcome.with_warning().registration for outcome in outcomes.values()]
 
     @_of_a_pair
@@ -280,14 +281,14 @@ class BatchJob:
     @computed_on_cpu
     def _register_prepared(self, pair: PreparedPair) -> PairResult:
         """The result of a pair alone."""
-        if self.method.uses_channels:
+        if self.method.uses_channels and not self.checked:
             source, target = without_sensor_patterns(*pair.inputs[:2], self.method)
             pair = replace(pair, inputs=pair.inputs._replace(source=source, target=target))
         run = self._run(pair)
         if isinstance(run, PairResult):
             return run
         (result,) = results_of([run], [None])
-        return self._result(pair.index, pair.checked(result))
+        return self._result(pair.index, pair.checked(result), pair.doubt or run.doubt)
 
     def register_in_chunks(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
         """Register the pairs in chunks on this machine. One thread prepares those of small clouds, several the others;
@@ -300,7 +301,7 @@ class BatchJob:
         with _cancelled(pool(1)) as one, _cancelled(pool(num_threads)) as threads:
             rejected: list[PairResult] = []
             again: collections.deque[Future[PairResult]] = collections.deque()
-            register = with_settings(on_host._register_prepared)
+            register = with_settings(unchecked._register_prepared)
 
             def prepared_pair(pair: Pair) -> PairResult | tuple[PreparedPair, ChunkPair]:
                 return (on_host if pair.index < _CHECKED else unchecked)._chunk_pair(pair)
@@ -328,7 +329,9 @@ class BatchJob:
                 source, target = pair.inputs[:2]
                 used = np.ones(min(len(source), most or len(source)), bool)
                 result = registration_of(ended.state, ended.assessment, ended.history, source, target, used)
-                yield self._result(pair.index, pair.checked(result))
+                is_doubtful = result.status is Status.UNVERIFIED
+                doubt = pair.doubt or (doubt_of_patterns(source) if is_doubtful else "")
+                yield self._result(pair.index, pair.checked(result), doubt)
             yield from rejected
             yield from (future.result() for future in again)
 
@@ -358,11 +361,11 @@ class BatchJob:
             arrays["deferred_neighbors"] = None
         return cloud.replace_rows(**arrays).pad()
 
-    def _result(self, index: int, result: RegistrationResult) -> PairResult:
+    def _result(self, index: int, result: RegistrationResult, doubt: str) -> PairResult:
         """The result without references to the clouds, and if so wanted without covariance."""
         if not self.covariances:
             result = result.build(**vars(result) | {"uncertainty": unknown_uncertainty()})
-        return PairResult(index, computed(result))
+        return PairResult(index, computed(result), doubt or None)
 
 
 @contextlib.contextmanager

@@ -135,9 +135,10 @@ def register(
             `RegistrationResult.covariance`. ξ is expressed at the origin and in the axes of the source. A GNSS
             covariance Σ in the target's axes becomes Rᵀ Σ R. At UTM coordinates, that of a pose measured at the cloud
             must be transported to their origin. Use a large finite variance for unmeasured directions. A variance of 0,
-            or any singular covariance, fixes directions: with zeros for z, roll and pitch the motion is planar. The
-            prior is also the initial pose if `init` is None. Outside of `jit`, standard deviations other than 0 count
-            as at least 1.1e-5 (in float64 4.7e-10) radians, or 1.1e-5 of the largest centred coordinate of the source.
+            or any singular covariance, fixes directions, whatever the clouds say: with zeros for z, roll and pitch the
+            motion is planar. The prior is also the initial pose if `init` is None. Outside of `jit`, standard
+            deviations other than 0 count as at least 1.1e-5 (in float64 4.7e-10) radians, or 1.1e-5 of the largest
+            centred coordinate of the source.
 
     With tie points or a prior, a first registration measures the covariance of the score of the matches. In it, tie
     points and prior act only in directions that they know far more precisely than the matches do. A second one starts
@@ -215,9 +216,19 @@ def register_from(
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         init, trusted = start.matrix, start.success
         if not trusted:
-            warn('init="global": too few matches of features support a pose; the one registered is UNVERIFIED')
+            warn(doubt_of_start_pose(start))
         options = replace(options, max_coarse_distance=coarse_distance_from(start, options))
     return verified(register_pair(source, target, method, init, options, tie_points, prior), trusted)
+
+
+def doubt_of_start_pose(start: GlobalPoseResult) -> str:
+    """Why a pose of `global_pose` is not to be trusted; nothing if it is."""
+    if start.success:
+        return ""
+    if start.ambiguous:
+        return "global pose: the matches of features support another pose as well, so that it is UNVERIFIED"
+    count = f"{start.num_inliers} of {start.num_matches}"
+    return f"global pose: only {count} matches of features support it, so that it is UNVERIFIED"
 
 
 def coarse_distance_from(start: GlobalPoseResult, options: Options) -> float:

@@ -56,7 +56,7 @@ from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 _FRACTION_OF_GATE = 0.25
 # Squared standard deviations of a prior beyond which a pose contradicts it: a right one in one of a million cases (χ²
 # with six degrees of freedom).
-_CONTRADICTION = 38.3
+CONTRADICTION = 38.3
 # Three points determine a pose; a fourth makes residuals possible.
 _MIN_CORRESPONDENCES = 4
 # Candidates of each source point in soft matches. Their weights fall off with a temperature of one spacing of the
@@ -363,7 +363,7 @@ def update(
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
         (settled & degenerate, Status.DEGENERATE),
-        (settled & (contradicts_prior(pose, measurements) | doubtful), Status.UNVERIFIED),
+        (settled & ((squares_from_prior(pose, measurements) > CONTRADICTION) | doubtful), Status.UNVERIFIED),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (coarse & ~converged, COARSE),
@@ -391,13 +391,13 @@ def _depends_on_channels(directions: Directions | None) -> Bool[AnyScalar, ""]:
     return np.bool_(False) if directions is None else jnp.any(directions.constrained_by_channels)
 
 
-def contradicts_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Bool[AnyScalar, ""]:
-    """Whether a pose that is the result is much further from the prior than its covariance allows."""
+def squares_from_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Float[AnyScalar, ""]:
+    """Squared distance of a pose from the prior, in its standard deviations, once it is weighed; else 0."""
     if not isinstance(measurements, Fusion):
-        return np.bool_(False)
+        return np.float32(0)
     rotation = pose.rotation().as_matrix().astype(measurements.center.dtype)
     residual, _ = measurements.prior_residual(rotation, pose.translation())
-    return residual @ measurements.form.prior.information @ residual > _CONTRADICTION
+    return residual @ measurements.form.prior.information @ residual
 
 
 def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:

@@ -27,7 +27,7 @@ from mcgicp_jax._local_geometry.cloud_statistics import (
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._local_geometry.sensor_patterns import (
     channels_may_move,
-    warn_of_patterns,
+    doubt_of_patterns,
     without_constant_part,
     without_patterns,
 )
@@ -50,7 +50,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_hard_matches,
     warn_of_inputs,
 )
-from mcgicp_jax._registration.loop import LoopResult, Problem, State, contradicts_prior
+from mcgicp_jax._registration.loop import CONTRADICTION, LoopResult, Problem, State, squares_from_prior
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
@@ -93,6 +93,7 @@ class Run(NamedTuple):
         executor: of the loop; None inside `jit`.
         state: computes the final state, whose pose is differentiable inside `jit`.
         assessment, moments: compute these of the final pose.
+        doubt: why the pose is UNVERIFIED, outside `jit`; or nothing.
     """
 
     inputs: Inputs
@@ -102,6 +103,7 @@ class Run(NamedTuple):
     state: Callable[[], State]
     assessment: Callable[[], Assessment]
     moments: Callable[[], Moments]
+    doubt: str = ""
 
 
 @with_settings_of_package
@@ -138,6 +140,8 @@ def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> Regist
         # Inside `grad` or `jvp`: the values are registered, and `results_of` adds the derivative. In a thread, since
         # calls of programs take longer inside transformations.
         ended = in_new_thread(partial(run, values, *arguments))
+    if ended.doubt:
+        warn(ended.doubt)
     (result,) = results_of([ended], [given])
     return result
 
@@ -226,16 +230,18 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         return run
     status = run.loop.state.status
     if status == Status.UNVERIFIED:
-        if contradicts_prior(run.loop.state.pose, run.problem.measurements):
-            warn("prior: the pose contradicts it by more than its covariance allows, and is UNVERIFIED")
+        square = squares_from_prior(run.loop.state.pose, run.problem.measurements)
+        if square > CONTRADICTION:
+            doubt = f"prior: the pose is {np.sqrt(square):.2g} standard deviations away from it, and UNVERIFIED"
         else:
-            warn_of_patterns(run.inputs.source)
+            doubt = doubt_of_patterns(run.inputs.source)
+        run = run._replace(doubt=doubt)
     elif not measures and status == Status.DEGENERATE and run.loop.state.directions is not None:
         _warn_of_near_points(run)
     elif not measures and status == Status.CONVERGED and doubt:
-        warn(f'{doubt}; the pose is UNVERIFIED. Try a better init, or init="global"')
         state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
-        run = run._replace(loop=run.loop._replace(state=state), state=lambda: state)
+        doubt = f"{doubt}: the pose is UNVERIFIED; if the clouds show the same place, try a better initial pose"
+        run = run._replace(loop=run.loop._replace(state=state), state=lambda: state, doubt=doubt)
     return run
 
 
@@ -364,8 +370,9 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[
         return run, ""
     (fit, little), other = doubt, finely()
     common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if little else ""
+    again = f"{common}another registration from the same start, with a smaller max_distance,"
     if other.loop.state.status not in USABLE:
-        return run, common and f"{common}a fine max_distance leads nowhere from the same start"
+        return run, f"{again} fails" if little else ""
     other_fit, _ = _fit(other)
     matches, other_matches = (float(each.loop.state.record.num_inliers) for each in (run, other))
     ours, theirs = float(fit) * matches, float(other_fit) * other_matches
@@ -374,8 +381,8 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[
     apart = distance_moved(state.pose, other.loop.state)
     if apart <= settings.fine_distance or not (little or (as_good and not better)):
         return other if better else run, ""
-    ends = f"{common}a coarse and a fine max_distance lead from the same start to poses {apart:.2g} m apart"
-    return other if better else run, ends if little else f"{ends}, at which surfaces coincide about as well"
+    again = f"{again} {'is the result' if better else 'ends'} {apart:.2g} m away"
+    return other if better else run, again if little else f"{again}, where surfaces coincide about as well"
 
 
 def _fit(run: Run) -> tuple[AnyScalar, AnyScalar]:
