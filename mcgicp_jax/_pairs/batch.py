@@ -108,10 +108,10 @@ def register_as_completed(
             default `KDTreeSearch` with one thread per pair. With `DenseSearch`, or without a search on accelerators,
             pairs run in chunks of one vectorised program on `jax.default_device`, or spread over all local devices (not
             with an `executor`, `priors`, `equalize_channels` or `voxel_sizes`), which finds neighbours by brute force.
-            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points, but not for those
-            that fill half of an earlier one. Only the first eight pairs are looked at for warnings of neighbourhoods,
-            units and patterns in channels. Pairs that may have left a right initial pose, see `register`, are
-            registered again on the CPU.
+            It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points, for 20 to 40 s,
+            but not for one that fits in an earlier one of at most 1,024 points, or fills half of it. Only the first
+            eight pairs are looked at for warnings of neighbourhoods, units and patterns in channels. Pairs that may
+            have left a right initial pose, see `register`, are registered again on the CPU.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.
