@@ -39,21 +39,26 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
     points = points if rows.size == len(points) else points[rows]
     # Along columns NumPy reduces several times as fast.
     columns = np.ascontiguousarray(points.T, np.float64)
-    zero = np.flatnonzero(~columns.any(axis=0))[1:]
-    positions = equal_rows(columns.T, _MANY)
-    if (positions is None and not zero.size) or (points[:1] == points).all():
+    zeros = np.flatnonzero(~columns.any(axis=0))
+    left_out = np.zeros(len(points), bool)
+    left_out[zeros[1:]] = True
+    # Further zeros, which are frequent, take no part in the numbering of positions, which is slow.
+    others = np.flatnonzero(~left_out)
+    positions = equal_rows((columns[:, others] if zeros.size > 1 else columns).T, _MANY)
+    if (positions is None and zeros.size <= 1) or (points[:1] == points).all():
         # Points that are all at one place stay.
         return _without_far(columns, rows, finite)
-    left_out = np.zeros(len(points), bool)
     if positions is not None:
         _, first, counts = np.unique(positions, return_index=True, return_counts=True)
+        places = columns[:, others[first]].T
+        counts[~places.any(axis=1)] = max(zeros.size, 1)
         many = np.flatnonzero(counts > _MANY)
-        search, places = KDTreeSearch(workers=1), points[first].astype(np.float64)
+        search = KDTreeSearch(workers=1)
         _, near = search.query(search.build(places), places[many], min(1 + _NEAR, len(places)), np.inf)
         # The nearest is the position itself.
         around = counts[near[:, 1:]].max(axis=1)
-        left_out = np.isin(positions, many[counts[many] > _MANY * around]) & (points != 0).any(axis=1)
-    left_out[zero] = True
+        repeated = many[(counts[many] > _MANY * around) & places[many].any(axis=1)]
+        left_out[others] = np.isin(positions, repeated)
     measured = finite.copy()
     measured[rows[left_out]] = False
     return _without_far(columns[:, ~left_out], rows[~left_out], measured)
