@@ -49,16 +49,20 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
         # Points that are all at one place stay.
         return _without_far(columns, rows, finite)
     if positions is not None:
-        _, first, counts = np.unique(positions, return_index=True, return_counts=True)
-        places = columns[:, others[first]].T
-        counts[~places.any(axis=1)] = max(zeros.size, 1)
+        counts = np.bincount(positions)
+        places = np.empty((len(counts), 3))
+        places[positions] = columns[:, others].T
+        zero = np.flatnonzero(~places.any(axis=1))
+        counts[zero] = max(zeros.size, 1)
         many = np.flatnonzero(counts > _MANY)
         search = KDTreeSearch(workers=1)
         _, near = search.query(search.build(places), places[many], min(1 + _NEAR, len(places)), np.inf)
         # The nearest is the position itself.
         around = counts[near[:, 1:]].max(axis=1)
-        repeated = many[(counts[many] > _MANY * around) & places[many].any(axis=1)]
-        left_out[others] = np.isin(positions, repeated)
+        repeated = np.zeros(len(counts), bool)
+        repeated[many] = counts[many] > _MANY * around
+        repeated[zero] = False
+        left_out[others] = repeated[positions]
     measured = finite.copy()
     measured[rows[left_out]] = False
     return _without_far(columns[:, ~left_out], rows[~left_out], measured)
