@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.preprocess import finite_rows, preprocess, preprocessed_in, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids
 from mcgicp_jax._compute.cache import Lazy
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for, outside_trace
+from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
@@ -58,6 +58,7 @@ from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status, 
 from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
     BETTER,
+    CLOSE,
     GOOD_FIT,
     LITTLE_IN_COMMON,
     distance_moved,
@@ -210,8 +211,11 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     doubt = ""
     # A given coarse distance says how far off the initial pose may be.
     if not traced and options.max_distance is None:
-        finely = partial(solve, inputs, init, replace(options, max_coarse_distance=0.0))
-        run, doubt = _unless_left(run, init, len(coarse) > 0, finely)
+
+        def closely(max_distance: float) -> Run:
+            return solve(inputs, init, replace(options, max_distance=max_distance))
+
+        run, doubt = _unless_left(run, init, len(coarse) > 0, closely)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
@@ -359,34 +363,37 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
 
-def _unless_left(run: Run, init: Pose | None, at_scales: bool, finely: Callable[[], Run]) -> tuple[Run, str]:
-    """A registration, or `finely()`, the one with the fine `max_distance` alone, if it may have left a right initial
-    pose and surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing."""
-    settings, state = run.problem.settings, run.loop.state
+def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable[[float], Run]) -> tuple[Run, str]:
+    """A registration, or one from the same initial pose with a smaller `max_distance`, `closely(max_distance)`, if it
+    may have left a right initial pose and surfaces coincide better there (see `doubt_of_start`); and why its pose is
+    ambiguous, or nothing."""
+    settings, state, executor = run.problem.settings, run.loop.state, cast(HostExecutor, run.executor)
     source, target = run.inputs[:2]
     start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
-    doubt = doubt_of_start(start, state, settings, partial(_fit, run), at_scales)
+    doubt = doubt_of_start(start, state, settings, partial(surface_fit, run.inputs, executor, run.loop), at_scales)
     if doubt is None:
         return run, ""
-    (fit, little), other = doubt, finely()
+    fit, overlap, little, few = doubt
+    found = [(run, fit, overlap)]
+    for fraction in (1.0, CLOSE) if few and not little else (1.0,):
+        other = closely(fraction * float(settings.fine_distance))
+        if other.loop.state.status in USABLE:
+            found.append((other, *surface_fit(run.inputs, executor, other.loop)))
+
+    def evident(one: tuple[Any, ...], other: tuple[Any, ...], factor: float) -> bool:
+        comparable = one[2] <= other[2] or one[1] > GOOD_FIT
+        return bool(comparable and one[1] * one[2] > factor * other[1] * other[2])
+
+    best = reduce(lambda before, after: after if evident(after, before, BETTER) else before, found)
     common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if little else ""
     again = f"{common}another registration from the same start, with a smaller max_distance,"
-    if other.loop.state.status not in USABLE:
-        return run, f"{again} fails" if little else ""
-    other_fit, _ = _fit(other)
-    matches, other_matches = (float(each.loop.state.record.num_inliers) for each in (run, other))
-    ours, theirs = float(fit) * matches, float(other_fit) * other_matches
-    comparable = other_matches <= matches or other_fit > GOOD_FIT
-    better, as_good = (comparable and theirs > factor * ours for factor in (BETTER, 1.0))
-    apart = distance_moved(state.pose, other.loop.state)
-    if apart <= settings.fine_distance or not (little or (as_good and not better)):
-        return other if better else run, ""
-    again = f"{again} {'is the result' if better else 'ends'} {apart:.2g} m away"
-    return other if better else run, again if little else f"{again}, where surfaces coincide about as well"
-
-
-def _fit(run: Run) -> tuple[AnyScalar, AnyScalar]:
-    return surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop)
+    reason = f"{again} fails" if little and len(found) == 1 else ""
+    for each in found:
+        apart = distance_moved(best[0].loop.state.pose, each[0].loop.state)
+        if apart > settings.fine_distance and (little or evident(each, best, 1 / BETTER if few else 1.0)):
+            reason = f"{again} {'ends' if best[0] is run else 'is the result'} {apart:.2g} m away"
+            reason = reason if little else f"{reason}, where surfaces coincide about as well"
+    return best[0], reason
 
 
 def _equalized(given: Inputs, matches: Correspondences | None = None) -> Inputs:

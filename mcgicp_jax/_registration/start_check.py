@@ -31,20 +31,24 @@ from mcgicp_jax._registration.settings import Settings
 # or more in these rooms, 0.27 in furnished ones and in streets, 0.25 on KITTI; but less in 18 of 128 registrations of
 # raw scans, where another one, which is not better, costs its time alone.
 LEAST_FIT, _MANY = 0.08, 4000
-# The same for fewer matches, whose thick neighbourhoods fit wrong poses better: up to 0.2 in rooms of 500 to 2,000
-# points. With 0.08, 35 of 144 such registrations were CONVERGED up to 1.3 m off, and now one is. A pose with more
-# matches than the one that it replaces must fit so well, too. Scan lines match themselves at the initial pose, where
-# more points have matches, the fit was up to 0.14, and the evidence up to 2.7 times as large as at the right pose (a
-# LiDAR with an eighth of its beams); cut rooms have fewer matches at the right pose.
-GOOD_FIT = 0.25
-# Another pose is better if its overlap times its fit is at least so many times as large. It was 1.65 to 226 times as
-# large at right poses that replace wrong ones, and at most 1.04 times at wrong poses: on a plane, where any pose fits.
-# In between, as at a wrong pose in a room of 1,000 points, neither is promised.
+# The same for fewer matches, whose thick neighbourhoods fit wrong poses better: up to 0.29 in rooms of 330 to 2,000
+# points. A pose with more matches than the one that it replaces must fit so well, too. Scan lines match themselves at
+# the initial pose, where more points have matches, the fit was up to 0.16, and the evidence up to 3.2 times as large as
+# at the right pose (a LiDAR with an eighth of its beams); cut rooms have fewer matches at the right pose.
+GOOD_FIT = 0.3
+# Another pose is better if its evidence, overlap times fit, is at least so many times as large. It was 1.65 to 226
+# times as large at right poses that replace wrong ones, and at most 1.04 times at wrong poses: on a plane, where any
+# pose fits. In between neither is promised; and with few matches neither if the other pose is not this much worse.
 BETTER = 1.3
+# With few matches, a third registration with this fraction of the fine `max_distance`, 1.5 spacings, is compared as
+# well: where spacings are nearly as large as furniture, the fine distance leads from a right pose to a wrong one, too.
+# Of 576 registrations of such rooms, 22 were CONVERGED and off by more than six deviations with a second one alone, and
+# now two.
+CLOSE = 0.6
 # Fraction of the source points that lie on the target, in position, below which views have little in common. A pose at
-# which more points lie on surfaces may then win, though these coincide: of 160 views of rooms from 46 to 63° apart,
-# six were CONVERGED up to 1.3 m off, at 0.25 to 0.44. (Now none, and of 73 right ones, five are UNVERIFIED. Right poses
-# of KITTI and tables had at least 0.75, of 7-Scenes and of another LiDAR 0.42; the smaller distance led to them, too.)
+# which more points lie on surfaces may then win, though these coincide: of 160 views of rooms from 46 to 63° apart, six
+# were CONVERGED up to 1.3 m off, at 0.25 to 0.44. (Now none, and of 73 right ones, five are UNVERIFIED. Right poses of
+# KITTI and tables had at least 0.75, of 7-Scenes and of another LiDAR 0.42; the smaller distance led to them, too.)
 LITTLE_IN_COMMON = 0.6
 # Number of matches that are compared. Four times as many do not separate poses any better.
 _SAMPLE = 1024
@@ -56,9 +60,9 @@ def doubt_of_start(
     settings: Settings,
     measure_fit: Callable[[], tuple[AnyScalar, AnyScalar]],
     at_scales: bool = False,
-) -> tuple[AnyScalar, bool] | None:
-    """If a registration may have left a right initial pose: its fit, and whether the clouds have little in common; else
-    None. `measure_fit` computes its `surface_fit`.
+) -> tuple[AnyScalar, AnyScalar, bool, bool] | None:
+    """If a registration may have left a right initial pose: its `surface_fit`, which `measure_fit` computes, whether
+    the clouds have little in common, and whether there are few matches; else None.
 
     It may have left it if it has moved the points by more than the fine `max_distance`, and surfaces do not coincide at
     its pose, or have little in common. (At several scales the initial pose is known to be far off, where the fine
@@ -70,8 +74,8 @@ def doubt_of_start(
         return None
     fit, common = measure_fit()
     little = bool(common < LITTLE_IN_COMMON) and not at_scales
-    least = LEAST_FIT if state.record.num_inliers >= _MANY else GOOD_FIT
-    return (fit, little) if fit < least or little else None
+    few = bool(state.record.num_inliers < _MANY)
+    return (fit, common, little, few) if fit < (GOOD_FIT if few else LEAST_FIT) or little else None
 
 
 def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> tuple[AnyScalar, AnyScalar]:

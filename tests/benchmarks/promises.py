@@ -92,7 +92,7 @@ def start_cases() -> Iterator[Case]:
         "global": {"init": "global"},
         "prior": {"prior": (np.eye(4), prior)},
     }
-    for count in (500, 1000, 2000, 4000, 8000):
+    for count in (330, 500, 1000, 2000, 4000, 8000):
         for name, options in starts.items():
             yield case(f"office, {count:,} points, from {name}", partial(office, count=count), mcg.GICP(), options)
     for common in (0.67, 0.5):
