@@ -41,7 +41,6 @@ def channel_name(column: str) -> str | None:
 
 
 def arrays_of_columns(columns: Columns) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N C"], list[str]]:
-    """Points, channels and their names, from columns that include x, y and z."""
     columns = {column: values for column, values in columns.items() if values.dtype.kind in "fiu"}
     axes = {column.lower(): values for column, values in columns.items() if column.lower() in ("x", "y", "z")}
     if len(axes) < 3:
@@ -87,13 +86,8 @@ def with_unpacked_colors(columns: Columns) -> Columns:
 
 
 def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
-    """Points, channels and channel names of a structured array or pandas table with the columns x, y and z (other
-    numeric columns become channels, as in files) or of an Open3D cloud, legacy or tensor. Other arrays are returned
-    unchanged, without channels.
-
-    Raises `ValueError` for paths, `PointCloud`s, objects without points, structured arrays with masked fields, and
-    clouds of libraries whose coordinates have another name.
-    """
+    """Points, channels and names of an Open3D cloud (legacy, tensor), structured array or pandas table, whose columns
+    besides x, y and z become channels as in files. Other arrays are returned unchanged, without channels."""
     if isinstance(points, str | os.PathLike):
         raise ValueError(f"points: expected coordinates, got a path; mcgicp_jax.io.read({str(points)!r}) reads a file")
     for member, advice in (("point_format", "las.xyz"), ("covs", "cloud.points()[:, :3]")):

@@ -33,11 +33,8 @@ _SHARE, _SAME, _SPREAD = 0.08, 0.4, 0.05
 
 
 def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[AnyArray, "3"]:
-    """The step of the coordinates of a cloud on each axis, metres; 0 where it is below a third of the spacing.
-
-    Coarse steps of one or two axes count only if they are those of float32, or if the cloud is no exact regular sample
-    of surfaces, such as a height map, sections or profiles.
-    """
+    """The step of the coordinates on each axis, metres; 0 below a third of the spacing. Steps of one or two axes count
+    only if they are those of float32, or the cloud is no exact regular sample (height map, sections, profiles)."""
     step, float32 = (cached_with_cloud(_steps) if is_concrete(cloud) else _steps)(cloud)
     xp = numpy_for(step, spacing)
     coarse = step > _HARMFUL * spacing

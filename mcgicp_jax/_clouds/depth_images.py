@@ -14,8 +14,7 @@ _NO_DEPTH = 65535
 def back_project(
     depth: Any, intrinsics: Any, scale: int | float | None = None, max_depth: int | float | None = None
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 2"]]:
-    """Points of a pinhole camera (x right, y down, z ahead), metres, and their pixels (column, row), row by row; the
-    arguments are those of `PointCloud.from_depth`."""
+    """Points (x right, y down, z ahead; metres) and pixels (column, row), row by row, as in `PointCloud.from_depth`."""
     depth = np.asarray(depth)
     if depth.ndim != 2 or depth.dtype.kind not in "fiu":
         raise ValueError(f"depth: expected numbers of shape (height, width), got {depth.dtype} of shape {depth.shape}")

@@ -19,8 +19,7 @@ from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from
 
 
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
-    """T(−o_t) · T · T(o_s), (4, 4): the pose between coordinates relative to the clouds' origins, in its own precision.
-    Raises `ValueError` as `pose_matrix` does, for the argument `name`."""
+    """T(−o_t) · T · T(o_s), (4, 4): the pose between centred coordinates, in its own precision; `name`: for errors."""
     distance = 0.0
     if is_concrete(source.origin, source.points) and np.any(source.origin):
         radius = float(np.abs(np.asarray(source.points)).max(initial=0))
@@ -68,8 +67,7 @@ def pose_in_user_frame(
 
 
 class _InUserFrame(AbstractLinearMap):
-    """Derivative of `pose_in_user_frame` by the parameters `wxyz_xyz` and both origins (`start`: that of the source);
-    compiles nothing."""
+    """Derivative of `pose_in_user_frame` by `wxyz_xyz`, source origin (`start`) and target origin; compiles nothing."""
 
     def __init__(self, parameters: np.ndarray, rotation: np.ndarray, start: np.ndarray):
         turn = turn_by_quaternion(parameters[..., :4])

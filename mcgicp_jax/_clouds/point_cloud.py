@@ -79,8 +79,7 @@ def _advice(shape: tuple[int, ...]) -> str:
 
 
 def _checked_mask(channels: Any, channel_valid: Values | None, shape: tuple[int, ...]) -> Any:
-    """`channel_valid` for channels of this shape, also False where `channels` is a masked array; None if nothing is
-    missing. A single channel may have a 1-D mask."""
+    """`channel_valid` in this shape, False also where `channels` is a masked array; None if nothing is missing."""
     valid: Any = None
     if channel_valid is not None:
         valid = channel_valid if isinstance(channel_valid, jax.Array) else np.ma.filled(channel_valid, False)
@@ -116,13 +115,8 @@ def _blank(channels: Any, channel_valid: Any) -> Any:
 
 @dataclass(frozen=True)
 class Voxels:
-    """How a cloud was downsampled. An empty pytree, so that no program depends on it; copies that transformations of
-    JAX make lose it.
-
-    Attributes:
-        size: edge of the voxels, metres; None if every point was kept.
-        reason: why this size was chosen; "" if it was given.
-    """
+    """How a cloud was downsampled: edge of the voxels, metres (None: every point is kept), and why ("": it was given).
+    An empty pytree, so that no program depends on it; copies that transformations of JAX make lose it."""
 
     size: float | None = None
     reason: str = ""
@@ -523,7 +517,6 @@ _set_field = PointCloud.__setattr__
 
 
 def _set_or_advise(cloud: PointCloud, name: str, value: Any) -> None:
-    """Set a field in the constructor; afterwards, raise an error that names `replace`."""
     try:
         _set_field(cloud, name, value)
     except FrozenInstanceError as error:
@@ -535,7 +528,6 @@ PointCloud.__setattr__ = _set_or_advise  # type: ignore[assignment,method-assign
 
 
 def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
-    """The argument `name` as a `PointCloud`; messages of the `ValueError` for unsuitable ones start with the name."""
     if isinstance(cloud, PointCloud):
         return cloud
     with messages_named(name):

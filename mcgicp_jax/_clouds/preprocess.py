@@ -99,8 +99,7 @@ def preprocessed_in(
     search: AbstractSearch | None,
     checked: bool = True,
 ) -> PointCloud:
-    """`preprocess` for a cloud whose grid may be known, from `voxels_and_grids`. `checked`: whether to look at
-    neighbourhoods, for warnings."""
+    """`preprocess` with the grid of `voxels_and_grids`, if known. `checked`: look at neighbourhoods, for warnings."""
     check_preprocessing(voxel_size, num_neighbors)
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
@@ -229,8 +228,7 @@ def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> N
 
 
 def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | None = None) -> PointCloud:
-    """A raw cloud without padding, rows with NaN or infinity in any array, and placeholders; warns of the latter two.
-    `measured` are its `measured_rows`, if they are known."""
+    """A raw cloud without padding, non-finite rows and placeholders; warns of the latter two. `measured`: if known."""
     cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
         raise ValueError("cloud: expected concrete arrays, got tracers; call this outside of jit and vmap")

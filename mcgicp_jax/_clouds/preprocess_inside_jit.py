@@ -95,8 +95,7 @@ def _averaged(cloud: PointCloud, voxel_size: float, size: int) -> PointCloud:
 def _voxels_of(
     points: Float[Array, "N 3"], valid: Bool[Array, "N"], voxel_size: float
 ) -> tuple[Int[Array, "N"], Int[Array, "N"], Int[Array, ""]]:
-    """An order that sorts rows by voxel, the voxel number of each row in it, and the number of occupied voxels. Invalid
-    rows come last, with a number beyond all others."""
+    """Order of rows by voxel, invalid ones last; their voxel numbers in it (invalid: beyond all); number of voxels."""
     # The grid is turned like those of `grid_of`, but by other random numbers.
     low = jnp.min(jnp.where(valid[:, None], points, jnp.inf), axis=0)
     middle = 0.5 * (low + jnp.max(jnp.where(valid[:, None], points, -jnp.inf), axis=0))

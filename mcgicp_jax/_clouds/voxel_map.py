@@ -108,7 +108,6 @@ class VoxelMap:
             self._keys, self._sums = self._keys[near], self._sums[near]
 
     def cloud(self) -> PointCloud:
-        """The mean points and channels of the voxels, as a raw float64 cloud."""
         points = self._sums[:, 1:4] / self._sums[:, :1]
         values, counts = np.split(self._sums[:, 4:], 2, axis=1)
         valid = counts > 0

@@ -64,8 +64,7 @@ _MOSTLY_LINES = 0.5
 
 
 class Shape(NamedTuple):
-    """The neighbourhoods of a cloud: the fraction that are lines, the median of third over second extent, and the
-    median distance of the nearest neighbour, metres."""
+    """Neighbourhoods: fraction of lines; medians of third over second extent and of the nearest distance, metres."""
 
     lines: float
     thickness: float
@@ -104,7 +103,7 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
 
 
 def map_voxel_size(cloud: PointCloud) -> float:
-    """The voxel size of a map from its first cloud, metres: that of the cloud, or the spacing of its points."""
+    """Voxel size of a map from its first cloud, metres."""
     return voxels_for("auto", cloud).size or raw_spacing(cloud) or 1.0
 
 
@@ -115,8 +114,7 @@ def raw_spacing(cloud: PointCloud) -> float:
 
 
 def warn_of_shape(cloud: PointCloud, all_points: bool) -> None:
-    """Warn if a preprocessed cloud is a planar scan, or, if the user asked for `all_points`, if its neighbourhoods do
-    not span the surface."""
+    """Warn of planar scans, and if the user asked for `all_points`, of neighbourhoods that do not span the surface."""
     points, neighbors = np.asarray(cloud.points), cast(Any, cloud.deferred_neighbors)
     constant = (points == points[0]).all(axis=0)
     planar, examined = constant.sum() == 1, all_points and len(cloud) >= _LEAST_VOXELS
@@ -137,11 +135,8 @@ def warn_of_shape(cloud: PointCloud, all_points: bool) -> None:
 
 
 def _suitable_voxels(grids: Sequence[Grid]) -> Voxels:
-    """One voxel size for several raw clouds, and the reason; None where their points are spread evenly.
-
-    It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels, or a
-    larger one if neighbourhoods are thicker than 0.3 of their width and thinner there. A constant to autodiff.
-    """
+    """The smallest size at which no cloud has many lines or voxels, or a larger one that makes thick neighbourhoods
+    thinner; None where points are spread evenly. A constant to autodiff."""
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
     step: int | None = None
     reason = ""
@@ -225,14 +220,12 @@ class _Averages:
 
 
 def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
-    """The largest fraction of lines, thickness and spacing in any cloud."""
     shapes = side_by_side([partial(cloud.shape, step) for cloud in clouds])
     return Shape(*np.max(shapes, axis=0).tolist())
 
 
 def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) -> int | None:
-    """The smallest size at which few neighbourhoods are lines, or else the largest at which all clouds show the scene;
-    None if there is none. `step` is the current size."""
+    """The smallest size with few lines, or else the largest at which all clouds show the scene; None: there is none."""
 
     def suffices(cloud: _Averages, larger: int) -> bool:
         return not cloud.shows_scene(larger) or cloud.shape(larger).lines <= _MOST_LINES
@@ -249,8 +242,7 @@ def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) 
 
 
 def _thinner(clouds: Sequence[_Averages], thickness: float, start: int) -> int | None:
-    """The smallest size at which neighbourhoods are clearly thinner than `thickness`, the current one; None if there is
-    none. `start` is the size that is doubled: the current one or the spacing."""
+    """The smallest size with clearly thinner neighbourhoods than `thickness`, from `start` by doubling, or None."""
     for larger in range(start + _DOUBLE, start + _DOUBLE * _DOUBLINGS + 1, _DOUBLE):
         if not all(cloud.shows_scene(larger) for cloud in clouds):
             return None
@@ -287,7 +279,6 @@ def _step_of(size: float) -> int:
 
 
 def _size(step: int) -> float:
-    """Voxel size with this number, metres, to two digits."""
     return float(f"{10 ** (step / _STEPS):.2g}")
 
 

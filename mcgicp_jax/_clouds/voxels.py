@@ -24,8 +24,7 @@ TURN, VARIATION = np.pi / 3, 0.3
 def voxel_keys(
     points: Float[np.ndarray, "N 3"], voxel_size: float, first: Float[np.ndarray, "3"] | float
 ) -> Int[np.ndarray, "N"]:
-    """Keys of the voxels that contain the points, counted from the voxel `first`. Raises `ValueError` if a point lies
-    2²⁰ or more voxels from it along an axis."""
+    """Keys counted from the voxel `first`; `ValueError` if a point lies 2²⁰ or more voxels from it along an axis."""
     cells = np.floor(points / voxel_size) - first
     if np.abs(cells).max(initial=0) >= VOXELS_PER_AXIS // 2:
         worst = points[np.argmax(np.abs(cells).max(axis=1))]
@@ -50,8 +49,7 @@ def _packed(cells: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
 def voxel_order(
     columns: Float[np.ndarray, "3 N"], voxel_size: float
 ) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M"]]:
-    """An order that sorts points by voxel, and where each of the M occupied voxels starts in it. Raises `ValueError` if
-    the points extend over more than 2²¹ voxels along an axis."""
+    """Order of points by voxel, and where each voxel starts in it; `ValueError` beyond 2²¹ voxels along an axis."""
     # Unlike in `voxel_keys`, the indices take no more bits than the extent of the points needs.
     key, num_keys = np.zeros(columns.shape[1], np.int64), 1
     for column in columns:
@@ -73,8 +71,7 @@ def voxel_order(
 
 
 class Grid:
-    """The points of a cloud in the grid in which it is averaged: `columns` are coordinates along the axes of the grid,
-    metres; `measured` says which rows of the cloud these points are, None for all."""
+    """Points along the axes of their grid, `columns`, metres; `measured`: which rows of a cloud they are, None: all."""
 
     def __init__(self, columns: Float[np.ndarray, "3 N"], measured: Bool[np.ndarray, "M"] | None = None):
         self.columns, self.measured = columns, measured
@@ -91,11 +88,8 @@ class Grid:
 
 
 def grid_of(points: Float[np.ndarray, "N 3"], measured: Bool[np.ndarray, "M"] | None = None) -> Grid:
-    """The turned grid of finite points.
-
-    The angles are seeded by the numbers of points on either side of the middle: they differ between clouds, but not
-    with the order of the points, and are constants to autodiff.
-    """
+    """The turned grid of finite points. Its angles are seeded by the numbers of points on either side of the middle, so
+    that they differ between clouds, but not with the order of the points."""
     # Imported late: it takes a fifth of the import time of the package.
     from scipy.spatial.transform import Rotation
 
