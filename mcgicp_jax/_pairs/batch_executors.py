@@ -48,7 +48,6 @@ _START, _MEMORY = 3.2, 2**29
 
 
 def executor_of(executor: GivenExecutor) -> ChosenExecutor:
-    """The executor to use; `ValueError` unless it is None, "processes", "threads" or an executor that may run JAX."""
     if isinstance(executor, str) and executor == "processes":
         return Processes(num_cores())
     if isinstance(executor, str) and executor == "threads":
@@ -69,8 +68,7 @@ def executor_of(executor: GivenExecutor) -> ChosenExecutor:
 def run(
     job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None
 ) -> Generator[tuple[int, RegistrationResult], None, None]:
-    """Register the pairs and yield index and result of each as soon as it is computed; see `register_as_completed`.
-    `count` is the number of pairs, if it is known."""
+    """`register_as_completed` for pairs, whose number is `count`, if it is known."""
 
     def concrete(pair: Pair) -> Pair:
         if not is_concrete(pair.source, pair.target, pair.prior):
@@ -103,7 +101,6 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
 
 
 def _differentiable(answer: PairResult, pair: PreparedPair) -> RegistrationResult:
-    """The result with the derivative of its pose."""
     result = pair.checked(answer.registration)
     if not answer.jacobian:
         return result
@@ -143,8 +140,7 @@ def _by_processes(
 
 
 def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int | None) -> Iterator[PairResult]:
-    """The first pairs by threads, which measure how long a pair takes. If processes pay, they start while threads go
-    on, and register the rest."""
+    """Threads register the first pairs, and are timed. If processes pay, they start meanwhile and register the rest."""
     rest: Iterator[Pair] | None = None
     start = _Start(job, count)
 
@@ -170,13 +166,8 @@ def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int 
 
 
 class _Start:
-    """The start of processes for the rest of a batch, if they pay.
-
-    Attributes:
-        finished: number of pairs that threads have registered.
-        idle: seconds in which the caller had the results, or made the next pair; processes would not save them.
-        processes: None until they are started, and if they cannot run the job.
-    """
+    """The start of processes for the rest of a batch, if they pay. `processes`: None until they are started, and if
+    they cannot run the job. `idle`: seconds that processes would not save: the caller had results or made pairs."""
 
     def __init__(self, job: BatchJob, count: int | None):
         self._job, self._count = job, count
@@ -192,7 +183,6 @@ class _Start:
         self._possible = self._num_workers > 1 and current_process().name == "MainProcess"
 
     def waited_for(self, make: Callable[[], Pair | None]) -> Pair | None:
-        """The next pair, made by the caller."""
         begin = time.perf_counter()
         try:
             return make()
@@ -200,8 +190,7 @@ class _Start:
             self.idle += time.perf_counter() - begin
 
     def has_ended(self, pair: Pair) -> bool:
-        """Whether the processes run; starts them if they pay. `pair` is the next one, of which it is tried whether it
-        can be sent."""
+        """Whether the processes run; starts them if they pay, and tries to send the next `pair`."""
         if not self._possible:
             return False
         try:
@@ -243,14 +232,9 @@ class _Start:
 
 
 class ChunkedExecutor:
-    """Chunks of pairs submitted to an executor, and pairs to retry.
-
-    A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
-    failed chunks are suspects, submitted again at the end one by one: only those that fail alone get `WORKER_FAILED`.
-
-    Args:
-        at_home: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
-    """
+    """Chunks of pairs submitted to an executor. A chunk may fail because one of its pairs killed the worker, or because
+    another chunk broke the pool. Pairs of failed chunks are suspects, submitted again at the end one by one: only those
+    that fail alone get `WORKER_FAILED`. `at_home`: pairs that cannot be sent run in this process."""
 
     def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False):
         self._executor, self._at_home = executor, job if at_home else None
@@ -263,7 +247,6 @@ class ChunkedExecutor:
         self._submitted: dict[Future[list[PairResult]], list[Pair]] = {}
 
     def run(self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int) -> Iterator[PairResult]:
-        """Submit chunks, at most `max_submitted` at a time, and yield their results."""
         try:
             while chunk := list(itertools.islice(pairs, chunk_size)):
                 self._submit(chunk)
@@ -292,7 +275,6 @@ class ChunkedExecutor:
         self._submitted[future] = chunk
 
     def _receive(self) -> Iterator[PairResult]:
-        """Wait for at least one chunk and yield its results; the pairs of failed chunks become suspects."""
         done, _ = futures.wait(self._submitted, return_when=futures.FIRST_COMPLETED)
         for future in done:
             chunk = self._submitted.pop(future)
@@ -315,7 +297,6 @@ class ChunkedExecutor:
                 yield from map(PairResult.with_warning, results)
 
     def _retried(self, pair: Pair) -> PairResult:
-        """Submit a suspect alone and wait for its result."""
         self._submit([pair])
         future, _ = self._submitted.popitem()
         try:
@@ -337,10 +318,7 @@ def executor_like(executor: Executor) -> Executor:
 
 
 def _as_numpy(sent: Any) -> Any:
-    """Convert the JAX arrays in the fields of a dataclass to NumPy, for pickling.
-
-    float64 JAX arrays would become float32 if unpickled before x64 is switched on.
-    """
+    """JAX arrays as NumPy, for pickling: float64 ones would become float32 if unpickled before x64 is switched on."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, Options):

@@ -78,8 +78,7 @@ class PairWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Pair:
-    """The arguments of one pair. `traced` numbers the leaves of clouds, method and kernel by which the pose is to be
-    differentiated; if there are any, the clouds are preprocessed."""
+    """`traced`: numbers of leaves of clouds, method and kernel to differentiate by; if any, clouds are preprocessed."""
 
     index: int
     source: Cloud
@@ -91,13 +90,8 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairResult:
-    """The result of one pair.
-
-    Attributes:
-        reason: why it has no pose, or one that is UNVERIFIED; None if it has a pose, or the status is the reason.
-        warnings: issued in another process.
-        jacobian: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`.
-    """
+    """`reason`: why there is no pose, or an UNVERIFIED one; None otherwise, or if the status says it. `warnings`:
+    issued in another process. `jacobian`: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`."""
 
     index: int
     registration: RegistrationResult
@@ -106,7 +100,6 @@ class PairResult:
     jacobian: tuple[np.ndarray, ...] = ()
 
     def with_warning(self) -> PairResult:
-        """The result; issues the warnings, and a `PairWarning` if there is a reason for it."""
         for message in self.warnings:
             warn(message)
         reason = self.reason or doubt_of(self.registration)
@@ -119,10 +112,7 @@ class PairResult:
 
 @dataclass(frozen=True)
 class PreparedPair:
-    """A pair of preprocessed clouds; `doubt` says why the pose that `global_pose` found is doubtful, or nothing.
-
-    `max_coarse_distance` is that of `Options`; `prior` is that of the `Pair`.
-    """
+    """A pair of preprocessed clouds. `doubt`: why the initial pose of `global_pose` is doubtful; "" if it is not."""
 
     index: int
     inputs: Inputs
@@ -138,7 +128,6 @@ class PreparedPair:
 
     @property
     def traced(self) -> tuple[int, ...]:
-        """Numbers of the leaves that differentiation traces."""
         return tuple(i for i, leaf in enumerate(self.leaves) if not is_concrete(leaf))
 
     def checked(self, result: RegistrationResult) -> RegistrationResult:
@@ -161,11 +150,8 @@ def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True)
 class BatchJob:
-    """The settings common to all pairs, and the work on one pair or on several.
-
-    `checked`: whether to look at neighbourhoods, units and patterns in channels, and warn. (Patterns are left out in
-    any case; chunks find them on the device.)
-    """
+    """Settings of all pairs. `checked`: whether to look at neighbourhoods, units and patterns in channels, and warn.
+    Patterns are left out in any case; chunks find them on the device."""
 
     method: AbstractMethod
     options: Options
@@ -202,7 +188,6 @@ class BatchJob:
 
     @_of_a_pair
     def prepare(self, pair: Pair) -> PreparedPair | PairResult:
-        """The pair with its initial pose, or its result if it has none."""
         source, target = self._clouds(pair)
         options = self.options
         soft, equalized = options.soft_matches is not False, options.equalize_channels
@@ -280,7 +265,6 @@ class BatchJob:
 
     @computed_on_cpu
     def _register_prepared(self, pair: PreparedPair) -> PairResult:
-        """The result of a pair alone."""
         if self.method.uses_channels and not self.checked:
             source, target = without_sensor_patterns(*pair.inputs[:2], self.method)
             pair = replace(pair, inputs=pair.inputs._replace(source=source, target=target))
@@ -291,8 +275,7 @@ class BatchJob:
         return self._result(pair.index, pair.checked(result), pair.doubt or run.doubt)
 
     def register_in_chunks(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
-        """Register the pairs in chunks on this machine. One thread prepares those of small clouds, several the others;
-        these also register pairs again that may have left a right initial pose."""
+        """One thread prepares small pairs, several the others; these repeat pairs that may have left a right start."""
         # On the host neighbours are needed for warnings alone, of a sample of points.
         on_host = replace(self, options=replace(self.options, search=default_search(workers=1)))
         unchecked = replace(on_host, checked=False)
@@ -389,7 +372,6 @@ def _invalid(index: int, error: ValueError) -> PairResult:
 
 
 def _read(clouds: dict[str, Cloud]) -> dict[str, PointCloud]:
-    """Clouds by their names, read if they are functions; errors become a `ValueError` that names one."""
     sides = dict[str, PointCloud]()
     for name, cloud in clouds.items():
         if callable(cloud) and not isinstance(cloud, PointCloud):
@@ -400,7 +382,6 @@ def _read(clouds: dict[str, Cloud]) -> dict[str, PointCloud]:
 
 
 def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
-    """The cloud that a function returns; any error of it becomes a `ValueError` that says where it was raised."""
     try:
         return load()
     except (ValueError, OSError):
@@ -415,8 +396,7 @@ def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
 def _computed_ahead(
     function: Callable[[Pair], Any], pairs: Iterable[Pair], for_small: Executor, for_others: Executor, count: int
 ) -> Iterator[Any]:
-    """Yield `function(pair)` in order, with at most `_SMALL_AHEAD` calls computed ahead where pairs are small, else
-    `count`."""
+    """Yield `function(pair)` in order, with up to `count` calls ahead, or `_SMALL_AHEAD` where pairs are small."""
     futures: collections.deque[Future[Any]] = collections.deque()
     for pair in pairs:
         small = _is_small(pair)

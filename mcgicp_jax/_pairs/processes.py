@@ -39,8 +39,7 @@ _LOOK = 1.0
 
 
 class Processes(Executor):
-    """Single-threaded workers in other processes, from loky: they need no `__main__` guard, and wait for further calls
-    until the interpreter ends. All batches of this process share them."""
+    """Single-threaded loky workers, which need no `__main__` guard; batches share them until the interpreter ends."""
 
     # Chunks of all batches that have not ended, with their batches.
     _unfinished: ClassVar[dict[Future[Any], Processes]] = {}
@@ -70,8 +69,7 @@ class Processes(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Cancel the futures of this batch, if so wanted. Those in loky's queue cannot be cancelled: the workers are
-        ended instead, unless they are at work for another batch."""
+        """Futures in loky's queue cannot be cancelled: workers are ended instead, unless another batch uses them."""
         if not cancel_futures:
             return
         unfinished = dict(self._unfinished)

@@ -207,7 +207,6 @@ def register_from(
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
-    """`register` with its options as one object."""
     check_method(method)
     trusted = True
     if isinstance(init, str):
@@ -222,7 +221,6 @@ def register_from(
 
 
 def doubt_of_start_pose(start: GlobalPoseResult) -> str:
-    """Why a pose of `global_pose` is not to be trusted; nothing if it is."""
     if start.success:
         return ""
     if start.ambiguous:
