@@ -39,12 +39,10 @@ IDENTITY = np.array([1.0, 0, 0, 0, 0, 0, 0])
 
 
 def search_points(points: Float[np.ndarray, "N 3"]) -> SearchPoints:
-    """Points without descriptors."""
     return SearchPoints(points, np.zeros((len(points), 0), points.dtype), np.ones(len(points), bool))
 
 
 def by_position(rows: SearchPoints) -> SearchPoints:
-    """The same points without descriptors."""
     return SearchPoints(rows.points, rows.descriptors[:, :0], rows.valid)
 
 
@@ -74,11 +72,8 @@ class Correspondences(eqx.Module):
 
 @jax.tree_util.register_pytree_node_class
 class NeighborsOnDemand(Deferred):
-    """The (N, k) array of `AbstractSearch.neighbors`, whose rows are computed when they are first needed.
-
-    `find` maps row numbers, or None for all rows, to the rows of their k nearest neighbours. `anew` makes the same
-    object for pickles, so that a worker searches for the neighbours; None: pickles hold the whole array.
-    """
+    """The array of `AbstractSearch.neighbors`, whose rows `find` computes when they are needed (None: all). `anew`
+    makes the same object for pickles, so that a worker searches; None: pickles hold the whole array."""
 
     def __init__(
         self, find: Callable[[Any], Int[np.ndarray, "n k"]], shape: tuple[int, int], anew: Callable[[], Any] | None

@@ -31,7 +31,6 @@ _STORED = 2**24
 
 
 def default_search(traced: bool = False, workers: int = -1) -> AbstractSearch:
-    """`DenseSearch` for traced arrays on an accelerator, else `KDTreeSearch(workers)`."""
     return DenseSearch() if traced and on_accelerator() else KDTreeSearch(workers)
 
 
@@ -93,8 +92,7 @@ def _padded(rows: SearchPoints) -> SearchPoints:
 def _nearest(
     pose: Float[Array, "7"], source: SearchPoints, target: SearchPoints, num_candidates: int
 ) -> Int[Array, "m N"]:
-    """The m nearest target rows of each source row. First the m runs are found whose nearest rows are nearest, then the
-    nearest rows in these runs. Exact, since the nearest rows of these runs come before any row of another run."""
+    """Search the m runs whose nearest rows are nearest. Exact: these m rows come before any row of another run."""
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     moved = jnp.dot(source.points, rotation.T, precision="highest") + pose[4:]
     queries, targets = _coordinates(source._replace(points=moved)), _coordinates(target)
@@ -128,7 +126,6 @@ def _nearest(
 
 
 def _coordinates(rows: SearchPoints) -> Coordinates:
-    """The coordinates and descriptors of rows, each with the penalties for missing ones."""
     values = [*rows.points.T, *rows.descriptors.T]
     penalties = [None] * len(values) if rows.penalty is None else [None, None, None, *rows.penalty.T]
     return list(zip(values, penalties, strict=True))

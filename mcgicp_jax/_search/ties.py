@@ -58,11 +58,7 @@ class TreeBackend(abc.ABC):
 
 
 class TiedTree:
-    """A tree of points that finds the same neighbours whatever its kind: ordered by distance, ties by row.
-
-    Attributes:
-        points: (M, D) finite points, metres.
-    """
+    """A tree of finite points, metres, with the same answers whatever its kind: ordered by distance, ties by row."""
 
     def __init__(self, trees: TreeBackend, points: Float[np.ndarray, "M D"], most_equal: int = _MOST_EQUAL):
         self.points = points
@@ -81,7 +77,6 @@ class TiedTree:
         self._held, self._tree = points, trees.build(points)
 
     def leaf_order(self) -> Int[np.ndarray, "M"]:
-        """An order of the points in which neighbouring points follow each other; as they are, if many are equal."""
         size = len(self.points)
         return np.arange(size) if self._rows is not None else self._trees.leaf_order(self._tree, size)
 
@@ -100,14 +95,9 @@ class TiedTree:
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest points of each query (all points if there are fewer), ordered by distance and then row.
-
-        Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
-
-        Returns:
-            Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the k-th nearest
-            and the next, which is taken to lie at the bound if none is within it; 0 without a k-th nearest.
-        """
+        """The k nearest (all if there are fewer), ordered by distance and then row, M for none within `bound`; and the
+        slack: half the gap to the next, which is taken to lie at the bound if none is within it; 0 without a k-th.
+        Trees return ties in any order: a search for k + 1 neighbours reveals them."""
         if self._rows is not None:
             if k >= self._most_equal:
                 return TiedTree(self._trees, self.points, k + 1).nearest(queries, k, bound)
@@ -149,11 +139,7 @@ class TiedTree:
 def _nearest_in_all(
     points: Float[np.ndarray, "M D"], queries: Float[np.ndarray, "N D"], farthest: Float[np.ndarray, "N"], k: int
 ) -> Int[np.ndarray, "N k"]:
-    """The k nearest by brute force, for queries with long ties.
-
-    Args:
-        farthest: distance of the k-th neighbour, metres.
-    """
+    """Brute force, for queries with long ties; `farthest`: distance of the k-th neighbour, metres."""
     # Such queries mostly coincide, too.
     queries, first, whose = np.unique(queries, axis=0, return_index=True, return_inverse=True)
     nearest = np.empty((len(queries), k), np.int32)
@@ -169,8 +155,7 @@ def _nearest_in_all(
 
 
 def slack_of(farthest: Float[np.ndarray, "N"], following: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:
-    """Distance, metres, that a query may move before its k nearest rows can change: half the gap between the distances
-    of the k-th and the following row."""
+    """Metres that a query may move before its k nearest rows can change: half the gap to the following distance."""
     # The margin of 1e-6 covers rounding. Without a k-th nearest row the gap is NaN or −inf, and the slack 0.
     with np.errstate(invalid="ignore"):
         return 0.5 * (1 - 1e-6) * np.fmax(following - farthest, 0)

@@ -57,16 +57,9 @@ class TreeIndex(AbstractIndex):
     def nearest_of(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"] | None, max_distance: float, k: int
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest rows of each query.
-
-        Args:
-            queries: positions and descriptors, metres; rows that are not finite have no neighbours.
-            penalty: of the queries, as in `SearchPoints`.
-
-        Returns:
-            (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
-            k nearest rows can change, but for their order.
-        """
+        """The k nearest target rows, −1 for none; and the slack: metres that a query may move before they can change,
+        but for their order. Queries are positions and descriptors, metres; those that are not finite have no
+        neighbours."""
         indices, slack = np.full((len(queries), k), -1, np.int32), np.zeros(len(queries))
         if not self._rows.size:
             return indices, slack
@@ -149,11 +142,8 @@ class _TreeForChannels:
 
 
 class _MatchTracker:
-    """The k nearest target rows of each row of one source, for a sequence of poses.
-
-    Matches are provably unchanged while their source point has moved by less than half the gap between its k-th and its
-    next nearest target point since the last search. After the first poses this holds for most points.
-    """
+    """The k nearest target rows of one source, pose after pose. They are provably the same while a point has moved by
+    less than its slack since its last search; after the first poses this holds for most points."""
 
     def __init__(self, index: TreeIndex, trees: TreeBackend, source: SearchPoints, max_distance: float, k: int):
         self._index = index
