@@ -46,12 +46,8 @@ _TRIES = 2
 
 
 def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = False) -> Edge | None:
-    """The edge that a registration of cloud j to cloud i measures.
-
-    Its information is the inverse covariance within the constrained directions, and 0 along the others, so that
-    DEGENERATE registrations contribute as well. None unless the status is CONVERGED or DEGENERATE, the overlap is at
-    least 40 % and the covariance is known.
-    """
+    """The edge of a registration of cloud j to cloud i, with no information along unconstrained directions. None unless
+    the status is CONVERGED or DEGENERATE, the overlap is at least 40 % and the covariance is known."""
     overlap = float(np.asarray(result.overlap))
     if result.status not in (Status.CONVERGED, Status.DEGENERATE) or overlap < LEAST_OVERLAP:
         return None
@@ -152,8 +148,7 @@ class Trajectory:
         return _RANGES * float(np.median(np.linalg.norm(self._clouds[frame].coordinates, axis=1)))
 
     def _close_loop(self, last: int) -> None:
-        """Register the last frame to an earlier one nearby, if the motion between the two is less certain than a
-        registration, and correct the poses."""
+        """Register the last frame to a near one if the motion between them is uncertain, and correct the poses."""
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 

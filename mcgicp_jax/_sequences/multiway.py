@@ -183,10 +183,8 @@ def _initial_poses(
 def _chained(
     clouds: list[PointCloud], method: AbstractMethod, options: Options
 ) -> tuple[_Poses, _Registrations, float]:
-    """Poses of clouds registered in order, the registrations that they follow from, and the sum of the fits.
-
-    Each cloud is registered to both clouds before it, of which one may be of another place; the better fit is used.
-    """
+    """Poses of clouds registered in order, the registrations that they follow from, and the sum of the fits. Each cloud
+    is registered to both before it, of which one may be of another place; the better fit is used."""
     registrations: _Registrations = {}
     poses, steps, total = [np.eye(4)], [np.zeros(6)], 0.0
     for k in range(1, len(clouds)):

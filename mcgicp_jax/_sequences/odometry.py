@@ -211,7 +211,6 @@ class _Reader:
         return cloud
 
     def deskewed(self, name: str, cloud: PointCloud, motion: Any) -> PointCloud:
-        """The frame, ready to be registered: if it is raw, deskewed by the motion during its scan."""
         return self.prepared(name, deskew_scan(cloud, motion)) if self.deskew else cloud
 
 
@@ -252,7 +251,6 @@ class _Sensor(Iterator[OdometryStep]):
         return self.relocalizer is not None and self.relocalizer.is_lost
 
     def __next__(self) -> OdometryStep:
-        """Locate the sensor at the next frame, and add the frame to the maps."""
         name, cloud, prior = next(self.frames)
         if self.cloud is None:
             result, self.first = None, (name, cloud) if self.in_hindsight else None
@@ -288,7 +286,6 @@ class _Sensor(Iterator[OdometryStep]):
         return OdometryStep(self.pose, cloud, registration, self.is_lost or not is_usable(result), graph)
 
     def _begin(self, name: str, cloud: PointCloud) -> None:
-        """Make the maps, of the first frame."""
         voxel = cloud.voxel_size or float(point_spacing(cloud))
         if self.against_map:
             self.world = VoxelMap(voxel)

@@ -31,15 +31,13 @@ _SAMPLE, _SAME_SURFACE = 2048, 3.0
 
 
 class Relocalizer:
-    """A map of all frames whose poses are known, in which lost frames are found again. `is_lost`: whether tracking is
-    lost at the last frame."""
+    """A map of all frames whose poses are known. `is_lost`: whether tracking is lost at the last frame."""
 
     def __init__(self, voxel_size: float, method: AbstractMethod, options: Options, num_neighbors: int):
         self._world, self._settings = VoxelMap(voxel_size), (method, options, num_neighbors)
         self._overlap, self._misfit, self.is_lost = 0.0, np.inf, False
 
     def add(self, name: str, cloud: PointCloud, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Add a frame to the map; `name` is for error messages."""
         self._world.add(name, cloud, pose)
 
     def corrected(self, cloud: PointCloud, target: PointCloud, result: RegistrationResult) -> RegistrationResult | None:
@@ -65,8 +63,7 @@ class Relocalizer:
 
 
 def _misfit(source: PointCloud, target: PointCloud, result: RegistrationResult) -> float:
-    """The 90 % quantile of the distances along normals between matches, in thicknesses of the source's neighbourhoods;
-    infinite without matches or a usable pose."""
+    """90 % quantile of distances along normals, in thicknesses of neighbourhoods; infinite without matches or pose."""
     if not is_usable(result):
         return np.inf
     points, rows = source.coordinates, np.flatnonzero(np.asarray(source.valid))
