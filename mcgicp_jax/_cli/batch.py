@@ -53,8 +53,6 @@ _TRIED_AGAIN = ("invalid_input", "worker_failed")
 
 @dataclass(frozen=True)
 class FilePair:
-    """Two cloud files, relative to `folder`, and the initial pose, if given."""
-
     folder: Path
     source: str
     target: str

@@ -204,10 +204,8 @@ class PairOptions(Options):
 def check_outputs(
     *files: Path | None, cloud: Path | None = None, picture: Path | None = None, inputs: Sequence[Path] = ()
 ) -> None:
-    """Raise `ValueError` or `OSError`, before any work is done, for outputs that cannot or must not be written.
-
-    `files` are texts. `inputs` are clouds, which `cloud` may not replace, or folders, in which it may not be.
-    """
+    """Raise for outputs that cannot or must not be written. `files` are texts. `inputs` are clouds, which `cloud` may
+    not replace, or folders, in which it may not be."""
     for path in files:
         # Whether an existing text file is a cloud depends on its content.
         if path is not None and (path.suffix.lower() in _BINARY or (path.is_file() and is_cloud(path))):

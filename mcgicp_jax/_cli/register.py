@@ -69,7 +69,6 @@ class PreparedPair:
         print(f"matches:   up to {' m, then '.join(f'{float(distance):.3g}' for distance in distances)} m apart")
 
     def find_start(self) -> None:
-        """With `--init global`, start from the pose found by local features."""
         if self.options.init != "global":
             return
         result = mcg.global_pose(*(with_channels(cloud, self.choices.channels) for cloud in self.raw))
