@@ -21,7 +21,6 @@ from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 
 
 def per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -> Float[AnyArray, "C"]:
-    """The numbers broadcast to one per channel; `name` is the name of the parameter, for the error message."""
     if numbers.shape not in ((), (num_channels,)):
         raise ValueError(
             f"{name}: expected a scalar or shape ({num_channels},), for clouds of {num_channels} channels, "
@@ -151,7 +150,6 @@ Method = TypeVar("Method", bound=AbstractMethod)
 
 
 def with_unset_from(method: Method, resolved: Method) -> Method:
-    """The method, with the parameters that are None taken from the result of `resolve`."""
     return jax.tree.map(
         lambda own, other: other if own is None else own, method, resolved, is_leaf=lambda leaf: leaf is None
     )
@@ -176,13 +174,11 @@ class AbstractGeneralized(AbstractMethod):
 
 
 def identity(around: Neighborhoods) -> Float[Array, "6 n"]:
-    """The identity matrix for each point."""
     identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], around.own.dtype)
     return jnp.broadcast_to(identity, (6, around.own.shape[1]))
 
 
 def known_geometry(local: LocalGeometry | None) -> LocalGeometry:
-    """The local geometry; raises `ValueError` for a cloud that was not preprocessed."""
     if local is None:
         raise ValueError(NO_NEIGHBORS)
     return local

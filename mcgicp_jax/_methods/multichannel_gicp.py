@@ -261,10 +261,8 @@ def _differences(
 
 
 def _positive_definite(covariance: Float[np.ndarray, "C C"]) -> Float[np.ndarray, "C C"]:
-    """Raise the eigenvalues of the correlation matrix to a positive minimum.
-
-    They can be 0 or negative if a channel never differs, or because the entries come from different matches.
-    """
+    """Raise the eigenvalues of the correlation matrix to a positive minimum: they can be 0 or negative if a channel
+    never differs, or because the entries come from different matches."""
     deviations = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(np.float32).tiny))
     values, vectors = np.linalg.eigh(covariance / np.outer(deviations, deviations))
     return (vectors * np.maximum(values, _LEAST_CORRELATION)) @ vectors.T * np.outer(deviations, deviations)

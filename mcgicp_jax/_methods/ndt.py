@@ -163,14 +163,8 @@ def voxel_cells(
 
 
 class _Cells:
-    """The points of a cloud sorted by cell, and the moments of each cell.
-
-    Attributes:
-        order: (N,) point numbers, sorted by cell.
-        counts: (M,) number of points in each cell.
-        kept: (M,) False for cells that are left out.
-        means, spread: (3, M), and (6, M) covariances as rows xx, xy, xz, yy, yz, zz.
-    """
+    """The points of a cloud sorted by cell, `order` (N,), and moments of the M cells, as columns: `spread` (6, M) is
+    the covariance, and `kept` is False for cells that are left out."""
 
     def __init__(self, cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None):
         check_positive("voxel_size", voxel_size)
@@ -193,7 +187,6 @@ class _Cells:
         return np.add.reduceat(columns, self._starts, axis=1)
 
     def sum(self, rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D M"]:
-        """Sums over the points of each cell, in float64."""
         return self._reduced(np.take(_columns(rows), self.order, axis=1))
 
 
@@ -204,7 +197,6 @@ def _columns(rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D N"]:
 def _split(
     order: Int[np.ndarray, "N"], starts: Int[np.ndarray, "M"], cloud: PointCloud, channel_size: Values
 ) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M2"]]:
-    """Split cells by the channels of their points."""
     sizes = np.asarray(channel_size, np.float64)
     if sizes.shape not in ((), (cloud.channels.shape[1],)) or not np.all(sizes > 0):
         raise ValueError(f"channel_size: expected one positive number, or one per channel, got {channel_size!r}")
@@ -281,7 +273,6 @@ def _raised(min_ratio: Any, own: Rows) -> tuple[Float[Array, "n 3 3"]]:
 
 
 def _floored(symmetric: Float[np.ndarray, "6 M"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
-    """Matrices whose eigenvalues are at least `min_ratio` times the largest one."""
     values, vectors = np.linalg.eigh(symmetric[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
     raised = np.maximum(values, min_ratio * values[:, -1:])
     return (vectors * raised[:, None]) @ vectors.swapaxes(1, 2)

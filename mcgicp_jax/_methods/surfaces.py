@@ -44,14 +44,8 @@ SURFACE, NOISE, SEARCH = range(3)
 
 @dataclass(frozen=True, eq=False)
 class SurfaceTable:
-    """The surface of a concrete cloud, whose rows are computed when they are used.
-
-    Attributes:
-        table: of `Surface`, and of its `noise` if `observed`.
-        rows: (n,) those that are used; None for all.
-        search: the points, those of `rows`, as input of the search.
-        observed: as in `surface_pair`.
-    """
+    """The surface of a concrete cloud, whose rows are computed when they are used: all rows in `table`, with `noise` if
+    `observed`, and those of `rows` (None: all) in `search`."""
 
     table: ComputedTable
     rows: Any
@@ -75,7 +69,6 @@ class SurfaceTable:
         return self.search.valid.size
 
     def whole(self, num_threads: int | None = 1) -> Surface:
-        """All rows, computed."""
         return _surface_in(self.table.trees(self.rows, num_threads), self.search)
 
 
@@ -87,13 +80,7 @@ else:
 
 
 class SurfacePair(NamedTuple):
-    """Two clouds as the input of a registration.
-
-    Attributes:
-        method: with its unset parameters chosen from the data.
-        terms: the residuals of each correspondence.
-        source, target: the surfaces of both clouds; tables if everything is concrete.
-    """
+    """Two clouds as the input of a registration by a resolved method; tables if everything is concrete."""
 
     method: AbstractMethod
     terms: tuple[AbstractTerm, ...]
@@ -101,7 +88,6 @@ class SurfacePair(NamedTuple):
     target: AnySurface
 
     def whole(self) -> SurfacePair:
-        """With all rows of both surfaces."""
         return self._replace(source=whole_surface(self.source), target=whole_surface(self.target))
 
 
@@ -117,7 +103,6 @@ def input_of(surface: AnySurface, part: int, rows: Any) -> Input:
 
 
 def whole_surface(surface: AnySurface) -> Surface:
-    """The surface with all rows, as compiled programs need it."""
     return surface.whole() if isinstance(surface, SurfaceTable) else surface
 
 
@@ -132,14 +117,11 @@ def surface_pair(
     num_threads: int | None = 1,
     source_rows: Any = None,
 ) -> SurfacePair:
-    """Choose unset parameters from two clouds, and compute their surfaces.
+    """Choose unset parameters and compute both surfaces, of the source only `source_rows` (None: all).
 
-    Rows of concrete clouds are computed on the host when they are used, and are cached with each cloud. Inside
-    transformations both clouds share one compiled body, unless they are large.
-
-    Args:
-        observed: whether to compute observability, which `register` needs and the cost of given matches does not.
-        source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
+    Rows of concrete clouds are computed on the host when they are used, from neighbours among all points, and cached.
+    Traced clouds share one compiled body, unless they are large. `register` needs observability (`observed`); the cost
+    of given matches does not.
     """
     used = source if source_rows is None else _some_rows(source, source_rows)
     whole = cache(partial(local_geometries, source, target, method.uses_channels, (source_rows, None), num_threads))
@@ -180,11 +162,7 @@ def resolved(
     num_threads: int | None = 1,
     whole: Callable[[], tuple[LocalGeometry, LocalGeometry]] | None = None,
 ) -> AbstractMethod:
-    """The method with its unset parameters chosen as a registration of these rows of the source chooses them.
-
-    Args:
-        whole: computes the local geometry of these rows and of the target, for traced clouds.
-    """
+    """Choose unset parameters as a registration of `source_rows` does; `whole` gives the geometry of traced clouds."""
 
     def geometries(rows: tuple[Any, Any]) -> tuple[LocalGeometry, LocalGeometry]:
         if whole is None or is_concrete(source, target):
@@ -202,7 +180,6 @@ def kinds_of(terms: tuple[AbstractTerm, ...]) -> Kinds:
 
 
 def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarray, "N 3 3"]:
-    """Covariances of a method at the points of a concrete cloud; unset parameters are chosen from the cloud."""
     surface = surface_pair(method, cloud, cloud, observed=False).whole().source
     return np.asarray(alg.matrix_from_symmetric(jnp.asarray(surface.covariance.T)))
 
@@ -216,7 +193,6 @@ def _some_rows(cloud: PointCloud, rows: Any) -> PointCloud:
 
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
-    """The cloud as the input of a search."""
     numbers = search_numbers(method, cloud.channels, cloud.channel_valid)
     return search_rows(*numbers, cloud.points, cloud.channels, cloud.channel_valid, cloud.valid)
 
@@ -250,8 +226,7 @@ def search_rows(
 def surface_table(
     cloud: PointCloud, method: AbstractMethod, kinds: Kinds, with_geometry: bool, observed: bool
 ) -> ComputedTable:
-    """The surface of a concrete cloud, whose rows are cached with the cloud: `Surface`, and its `noise` if `observed`;
-    from its local geometry if the cloud has neighbours (`with_geometry`)."""
+    """The surface of a concrete cloud, with `noise` if `observed`, whose rows are cached with the cloud."""
     geometry = geometry_table(cloud, method.uses_channels) if with_geometry else None
     return _table(cloud, method, kinds, geometry, observed)
 
@@ -268,14 +243,9 @@ def differentiable_inputs(
     observed: bool = False,
     soft: bool = False,
 ) -> list[Input]:
-    """The surfaces of matched points on the host, as inputs of a row function with `matched_rows`.
-
-    Args:
-        source, target, method, terms: differentiation may trace them.
-        fixed: the clouds and the method, its parameters chosen, without these traces, see `primal`.
-        indices: rows of the target, −1 where there is no match.
-        soft: whether to include the descriptors.
-    """
+    """The surfaces of matched points on the host, as inputs of a row function with `matched_rows`; with descriptors if
+    `soft`. `fixed`: the clouds and the resolved method without traces of differentiation, see `primal`. `indices`: −1
+    where there is no match."""
     *clouds, chosen = fixed
     sides = ((source, clouds[0], source_rows), (target, clouds[1], indices))
     with_geometry = observed or all(cloud.deferred_neighbors is not None for _, cloud, _ in sides)
@@ -330,7 +300,6 @@ def _inputs(method: AbstractMethod, cloud: PointCloud, with_geometry: bool) -> l
 
 @cache
 def _surface_rows(kinds: Kinds, observed: bool, with_geometry: bool) -> Callable[..., Any]:
-    """The row function of `surface_of`, for `_inputs` and the local geometry."""
 
     def surface(method: AbstractMethod, own: Rows, *rest: Rows) -> tuple[Any, ...]:
         near, local = (rest[:-1], rest[-1].tree) if with_geometry else (rest, None)
