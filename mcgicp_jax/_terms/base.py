@@ -159,7 +159,6 @@ def is_adaptive(terms: tuple[AbstractTerm, ...]) -> bool:
 
 
 def with_numbers_of(terms: tuple[AbstractTerm, ...], others: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-    """The terms with the numbers that the others have estimated, as constants to autodiff."""
     return tuple(
         term.with_numbers_of(other) if isinstance(term, AbstractAdaptiveTerm) else term
         for term, other in zip(terms, others, strict=True)

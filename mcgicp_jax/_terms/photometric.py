@@ -128,13 +128,11 @@ class Photometric(AbstractAdaptiveTerm):
 
     Attributes:
         spacing: of the target, metres.
-        deviations: σ of each residual, metres and channel units; 0 before the first estimate.
+        deviations: σ of each residual, metres and channel units; 0 before the first estimate, when `coarse` is used.
         designs: f/q, design effect over reliability, of each residual.
         gains, offsets: applied to the fitted values of the source's channels; 1 and 0 unless `equalizes_channels`.
-        coarse: the term of the coarse phase, before the first estimate.
         robust: kernel of each residual in standard deviations; None: Cauchy's with k² = 20. Each residual has its own
             weight: a reflection is an outlier of the channels, but not of the geometry.
-        equalizes_channels: whether gains and offsets are estimated.
     """
 
     name: ClassVar[str] = "photometric"
@@ -308,7 +306,6 @@ class Photometric(AbstractAdaptiveTerm):
 
 
 def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
-    """Σ_c |u_c|², with u_c the sum of the scores in a cell."""
     columns = scores.reshape(-1, scores.shape[-1])
     if numpy_for(scores, cells) is np:
         sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
