@@ -17,13 +17,11 @@ _REGULARISATION = 1e-6
 def channel_kernel(around: Neighborhoods, covariance: Float[Array, "..."]) -> Float[Array, "k n"]:
     """Channel similarity λ_j of each neighbour and its point: exp(−½ Δᵀ Λ⁻¹ Δ) (Servos & Waslander 2014, eq. 7).
 
-    `covariance` is Λ: scalar, (C,) variances or (C, C), channel units².
-
-    Where points lack channels, Δ is restricted to the channels that both have, with the marginal of Λ. For each channel
-    that a neighbour lacks, λ_j is multiplied by the mean single-channel kernel of the neighbours that have it (1 if
-    none has). A factor of 1 would treat the neighbour as similar and stretch Ω across the border of a camera's view;
-    ignoring the neighbour would shrink Ω there. At artificial borders through scans with complete channels, this choice
-    biased Ω the least.
+    `covariance` is Λ, channel units²: scalar, (C,) variances or (C, C). Where points lack channels, Δ is restricted to
+    the channels that both have, with the marginal of Λ. For each channel that a neighbour lacks, λ_j is multiplied by
+    the mean single-channel kernel of the neighbours that have it (1 if none has). A factor of 1 would stretch Ω across
+    the border of a camera's view; ignoring the neighbour would shrink Ω there. At artificial borders through scans with
+    complete channels, this choice biased Ω the least.
     """
     count, correlated = around.num_channels, covariance.ndim == 2
     differences = [around.difference(channel) for channel in range(count)]
@@ -68,10 +66,7 @@ def _marginal_square(
 
 
 def plane_covariance(local: LocalGeometry, epsilon: Float[Array, ""]) -> Float[Array, "6 N"]:
-    """GICP's covariance I − (1−ε) n nᵀ: 1 within the surface, ε along n (Segal et al., Generalized-ICP, RSS 2009).
-
-    It is the identity where all neighbours coincide and there is no normal.
-    """
+    """GICP's covariance I − (1−ε) n nᵀ (Segal et al., RSS 2009); the identity where all neighbours coincide."""
     covariance = local.covariance.T
     spread = covariance[0] + covariance[3] + covariance[5] > 0
     identity = jnp.array([[1.0], [0.0], [0.0], [1.0], [0.0], [1.0]], covariance.dtype)
@@ -87,9 +82,8 @@ def multichannel_covariance(
 ) -> Float[Array, "6 N"]:
     """MC-GICP's covariance: Ω in the tangent plane, ε along the normal (Servos & Waslander 2014, eqs. 6-10).
 
-    Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} (Σ_t weighted by λ, the result of `channel_kernel`; Σ_w unweighted) is computed as
-    I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}, to give GICP's covariance for uniform channels. The eigenvalues of Ω, which
-    approach 0 where no neighbour has similar channels, are at least `min_eigenvalue`.
+    To give GICP's covariance for uniform channels, Ω = Σ_w^{-1/2} Σ_t Σ_w^{-1/2} (Σ_t weighted by λ of
+    `channel_kernel`, Σ_w unweighted) is computed as I + Σ_w^{-1/2} (Σ_t − Σ_w) Σ_w^{-1/2}.
     """
     weighted_by_kernel = weighted_covariance(offsets_of(around), jnp.where(around.present, kernel, 0))
     u, v = alg.orthonormal_basis(local.normal.T)

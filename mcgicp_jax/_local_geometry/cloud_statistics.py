@@ -40,10 +40,8 @@ _OTHER_EXPOSURE = 1.5
 def channel_noise(
     source: PointCloud, target: PointCloud, geometries: Geometries
 ) -> tuple[Float[AnyArray, "C"], Bool[AnyArray, "C"], Float[AnyScalar, ""]]:
-    """Noise σ per channel, which channels are uniform (σ = 1), and the variance λ₀ along the normal, metres².
-
-    σ is the median deviation from linear fits and λ₀ the median variance of neighbours, over samples of both clouds.
-    """
+    """Noise σ per channel, the median deviation from linear fits (1 for uniform channels), which channels are uniform,
+    and the median variance λ₀ along the normal, metres²; from samples of both clouds."""
     samples = [_noise_rows(cloud) for cloud in (source, target)]
     local_geometries = constant(geometries((samples[0][0], samples[1][0])))
     xp = numpy_for(source, target, local_geometries)
@@ -94,7 +92,6 @@ def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:
 
 
 def _variance_along_normal(local: LocalGeometry) -> Float[AnyArray, "N"]:
-    """λ₀ = nᵀ C n, metres²."""
     xx, xy, xz, yy, yz, zz = local.covariance.T
     x, y, z = local.normal.T
     with np.errstate(over="ignore", invalid="ignore"):
@@ -111,17 +108,14 @@ def _channel_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:
 
 
 def point_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
-    """Median nearest-neighbour distance, metres, ignoring coincident neighbours; 0 if all neighbours coincide.
-
-    Some files hold points twice, and some scanners report each beam without an echo as a point at the origin.
-    """
+    """Median nearest-neighbour distance, metres, ignoring coincident neighbours: some files hold points twice, and some
+    scanners report each beam without an echo as a point at the origin. 0 if all neighbours coincide."""
     return _spacings(cloud)[0]
 
 
 def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
     """Spacing of a square grid with the density of the points, metres: the median of √(π/k) times the distance of the
-    k-th neighbour. For scan lines it is larger than `point_spacing`, the spacing along the lines.
-    """
+    k-th neighbour. For scan lines it exceeds `point_spacing`, the spacing along them."""
     return _spacings(cloud)[1]
 
 
@@ -130,7 +124,6 @@ def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar,
 
 
 def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
-    """`point_spacing` and `grid_spacing`."""
     xp = numpy_for(cloud)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
     # (k, n): neighbours come first, so that NumPy's loops run over the points.
@@ -201,11 +194,9 @@ def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
 def with_channels_matched(
     source: PointCloud, target: PointCloud, matches: Correspondences | None = None
 ) -> tuple[PointCloud, Float[AnyArray, "C"]]:
-    """The source with a gain and an offset applied to each channel, so that its distribution matches the target's; and
-    the gains.
+    """The source with `gain_and_offset` applied, so that it matches the target; and the gains. Constants to autodiff.
 
-    See `gain_and_offset`; both are constants to autodiff. With `matches`, only values of valid matches are used.
-    Regression over matches is not used: noise, and matches across edges, would bias the gain towards 0.
+    With `matches`, only matched values count. Noise and matches across edges would bias a regression's gain towards 0.
     """
     gain, offset = _gains_and_offsets(source, target, matches)
     xp, dtype = numpy_for(source, gain), source.channels.dtype
@@ -230,10 +221,8 @@ def _gains_and_offsets(
 def gain_and_offset(
     values: Float[AnyArray, "n C"], wanted: Float[AnyArray, "m C"]
 ) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
-    """Gain and offset of each channel that give its `_QUANTILES` the mean and standard deviation of the wanted ones.
-
-    NaNs are ignored; 1 and 0 for channels without usable spread.
-    """
+    """Gain and offset of each channel that give its `_QUANTILES` the mean and standard deviation of the wanted ones,
+    ignoring NaN; 1 and 0 for channels without usable spread."""
     xp = numpy_for(values, wanted)
     fractions = xp.asarray(_QUANTILES, values.dtype)
     # Channels whose statistics overflow remain as they are.

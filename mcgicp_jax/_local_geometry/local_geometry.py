@@ -97,9 +97,8 @@ def offsets_of(around: Neighborhoods) -> Offsets:
 def _covariances_of_halves(
     offsets: Offsets, present: Float[Array, "k N"], covariance: Float[Array, "6 N"]
 ) -> tuple[list[Float[Array, "6 N"]], Float[Array, "M"]]:
-    """Covariances of two halves of each neighbourhood, whose own `covariance` is known: of every second neighbour, from
-    the first and from the second on. And the numbers of neighbours: in all, in the first and in the second halves (M =
-    3 N)."""
+    """Covariances of every second neighbour, from the first and from the second on; and the numbers of neighbours: in
+    all, in the first and in the second halves (M = 3 N)."""
     count = jnp.sum(present, axis=0)
     # About the mean of all, so that the sums over one half and over the other add up to those over all.
     x, y, z = (present * (offset - jnp.sum(offset, axis=0) / jnp.maximum(count, 1)) for offset in offsets)
@@ -121,8 +120,7 @@ def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float
 
 
 def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
-    """Median edge of the cells, metres. Their median distance may be smaller, where a plane between two layers of
-    voxels leaves cells close together."""
+    """Median edge of cells, metres; their distance may be less, where a plane lies between two layers of voxels."""
     xp = numpy_for(cells)
     rows, valid = sampled_rows(xp.asarray(cells.valid))
     traces = xp.trace(xp.asarray(cells.covariances)[rows], axis1=1, axis2=2)
@@ -130,8 +128,7 @@ def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def geometry_of_cells(local: LocalGeometry, covariances: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
-    """Local geometry of cells, `num_candidates` of which are matched with each point or cell: from their covariances,
-    metres²; only the channel fits are those of `local`, the geometry of their neighbourhoods."""
+    """Local geometry of cells from their covariances, metres²; only the channel fits are those of `local`."""
     covariances = jax.lax.stop_gradient(covariances)
     normal = alg.smallest_eigenvector(covariances)
     across = alg.inner(normal, alg.multiply(covariances, normal))
@@ -153,8 +150,7 @@ def local_geometries(
     rows: tuple[Any, Any] = (None, None),
     num_threads: int | None = 1,
 ) -> tuple[LocalGeometry, LocalGeometry]:
-    """Local geometry of rows (None: all) of two preprocessed clouds; `with_channels` as in `with_near`. The host uses
-    at most `num_threads` threads (None: no limit)."""
+    """Local geometry of rows (None: all) of two preprocessed clouds; on the host by `num_threads` (None: no limit)."""
     if is_concrete(source, target):
         calls = [
             partial(geometry_table(target, with_channels).trees, rows[1], num_threads),
@@ -171,7 +167,6 @@ def local_geometries(
 
 @cached_with_cloud
 def geometry_table(cloud: PointCloud, with_channels: bool) -> ComputedTable:
-    """Local geometry of a concrete cloud, cached with the cloud."""
     return _table(cloud, with_channels, cloud)
 
 
@@ -193,13 +188,10 @@ def _geometry(_: None, own: Rows, near: Rows) -> tuple[LocalGeometry]:
 
 
 class SurfaceNoise(NamedTuple):
-    """Values that only the status and the covariance of the final pose need; one row per point.
+    """Values that only the status and the covariance of the final pose need, most of them as in `LocalGeometry`.
 
     Attributes:
         descriptors: variance of the descriptors α · channel about their linear fits, metres², summed over the channels.
-        normal: unit normal.
-        roughness: half the squared height difference along the normal between a point and a neighbour, metres².
-        neighborhood_radius: distance to the farthest neighbour, metres.
         slopes: gradients of the descriptors; None where channels are not used, and for cells.
     """
 
@@ -248,7 +240,6 @@ class Surface(NamedTuple):
 
 
 def searched(surface: Surface) -> SearchPoints:
-    """The search input of the surface of a whole cloud."""
     if surface.search is None:
         raise ValueError("surface: expected one with the input of the search")
     return surface.search

@@ -96,11 +96,7 @@ class PointRows(NamedTuple):
 
 
 def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
-    """The points and their neighbours as inputs of a row function, for `neighborhoods`.
-
-    Without channels, the programs do not depend on their number. `with_given` includes the covariances given with the
-    cloud.
-    """
+    """Inputs for `neighborhoods` in a row function. Without channels, the programs do not depend on their number."""
     # Neighbours and `valid`, which differentiation does not trace.
     xp = numpy_for(cloud.deferred_neighbors, cloud.valid)
     neighbors, valid = check_neighbors(cloud, xp), xp.asarray(cloud.valid)
@@ -114,14 +110,12 @@ def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) 
 
 
 def of_rows(inputs: list[Input], rows: Any) -> list[Input]:
-    """The inputs restricted to rows (None: all)."""
     if rows is None:
         return inputs
     return [entry._replace(index=rows if entry.index is None else entry.index[rows]) for entry in inputs]
 
 
 def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
-    """The neighbourhoods of rows of the inputs `with_near`, or the points alone."""
     if near is None:
         return Neighborhoods(own.tree.points.T, own.tree.given)
     present, measured, own_channels = near.index >= 0, own.tree.measured, own.tree.channels.T
@@ -139,14 +133,12 @@ def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
 
 
 class ChannelFits(NamedTuple):
-    """Linear fit of each channel over the tangent plane, in the basis `orthonormal_basis(normal)`; one row per point.
-
-    Where too few neighbours have the channel, the residual is NaN and the other values are 0.
+    """Linear fit of each channel over the tangent plane, in the basis `orthonormal_basis(normal)`.
 
     Attributes:
         gradients: of the fits to every second neighbour, from the first and from the second on, channel units per
-            metre. Their noise is independent.
-        residual: variance of the channel about the fit, channel units².
+            metre; 0 where too few neighbours have the channel. Their noise is independent.
+        residual: variance of the channel about the fit, channel units²; NaN where too few neighbours have it.
         inverse: inverse of the normal matrix (symmetric), 1/metres²: times `residual`, the covariance of the gradient.
     """
 
@@ -179,11 +171,8 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
 
 
 class LinearFit(NamedTuple):
-    """Weighted linear fits over a plane: `inverse` is that of the normal matrix, `weight` the sum of the weights.
-
-    Gradient and inverse are 0 where the points lie on a line; the residual variance is meaningless for three points or
-    fewer.
-    """
+    """Fits over a plane, with the inverse of the normal matrix and the sum of the weights. Gradient and inverse are 0
+    where the points lie on a line; the residual variance is meaningless for three points or fewer."""
 
     gradient: Float[Array, "2 ..."]
     residual: Float[Array, "..."]
@@ -204,8 +193,7 @@ def fit_linear(
 def _fit_sums(
     x: Float[Array, "k N"], y: Float[Array, "k N"], values: Float[Array, "k N"], weights: Float[Array, "k N"]
 ) -> Float[Array, "10 N"]:
-    """Weighted sums of 1, x, y, x², xy, y², v, xv, yv and v², from which a fit is computed. With an origin of x and y
-    far from their mean, the fit would be lost to rounding."""
+    """Input of `_fit_of`. With an origin of x and y far from their mean, the fit would be lost to rounding."""
     wx, wy, wv = weights * x, weights * y, weights * values
     products = (weights, wx, wy, wx * x, wx * y, wy * y, wv, wv * x, wv * y, wv * values)
     return jnp.stack([jnp.sum(product, axis=0) for product in products])

@@ -79,7 +79,6 @@ def channels_may_move(source: PointCloud) -> Bool[AnyScalar, ""]:
 
 
 def doubt_of_patterns(source: PointCloud) -> str:
-    """That a pose is UNVERIFIED because no channel of a concrete cloud, constant ones apart, is a texture."""
     largest = [max(both) for both in zip(*explained(source), strict=True)]
     shares = [f"{share:.0%} of {name}" for name, share in zip(source.channel_names, largest, strict=True) if share < 1]
     return (
@@ -89,8 +88,7 @@ def doubt_of_patterns(source: PointCloud) -> str:
 
 
 def without_patterns(source: PointCloud, target: PointCloud) -> list[PointCloud]:
-    """The clouds with those channels set to 0 that are a function of range, elevation or azimuth in the source (the
-    target may be a map)."""
+    """Set channels to 0 that are a function of range, elevation or azimuth in the source (the target may be a map)."""
     if not source.channels.shape[1] or source.channels.shape[1] != target.channels.shape[1]:
         return [source, target]
     by_angles = explained(primal(source)).by_angles
@@ -114,8 +112,7 @@ def _blank(cloud: PointCloud, left_out: Bool[AnyArray, "C"]) -> PointCloud:
 
 
 def without_constant_part(cloud: PointCloud) -> PointCloud:
-    """The cloud with channels marked as missing where more than half of its points have one value and lie together,
-    such as black outside of an image: the edge of this part may move with the sensor."""
+    """Mark a constant part, such as black outside of an image, as missing: its edge may move with the sensor."""
     if not cloud.channels.shape[1]:
         return cloud
     fixed = primal(cloud)
@@ -155,7 +152,6 @@ def _missing(cloud: PointCloud, part: Bool[AnyArray, "N C"]) -> PointCloud:
 
 
 def explained(cloud: PointCloud) -> Explained:
-    """Cached with a concrete cloud, and constant to autodiff."""
     return cached_with_cloud(_explained)(cloud) if is_concrete(cloud) else _explained(constant(cloud))
 
 
@@ -245,8 +241,7 @@ def _first_half(num_rows: int) -> int:
 
 
 def _monomials(sample: _Sample) -> Float[AnyArray, "m n"]:
-    """Products of up to `_DEGREE` coordinates about the centroid, which level off far from it; scaled to unit root mean
-    square."""
+    """Products of up to `_DEGREE` coordinates about the centroid, which level off far from it; root mean square 1."""
     xp = numpy_for(sample)
     count = xp.maximum(sample.present.sum(), 1)
     offset = sample.points - sample.points.sum(axis=1, keepdims=True) / count

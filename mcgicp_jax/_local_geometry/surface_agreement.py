@@ -53,12 +53,11 @@ def agreement_of(
     thicknesses: tuple[Float[AnyArray, "n"], Float[AnyArray, "n"]],
     matched: Bool[AnyArray, "n"],
 ) -> tuple[AnyScalar, AnyScalar]:
-    """Misfit of matches and agreement of their normals; ∞ and 0 if none are `matched`. Offsets and thicknesses are in
-    metres, normals in one frame.
+    """Misfit of matches and agreement of their normals, which are in one frame; ∞ and 0 if none are `matched`.
 
     The misfit is a quantile of the distances along the normals, in thicknesses of the neighbourhoods; the agreement is
     the fraction of normals that agree. Both weigh each direction of surfaces equally, so that the ground does not
-    outvote the few surfaces that distinguish a place.
+    outvote the few surfaces that distinguish a place. Offsets and thicknesses are in metres.
     """
     xp = numpy_for(offsets, both_normals, thicknesses, matched)
     normals, other_normals = both_normals
@@ -80,8 +79,7 @@ def agreement_of(
 def spreads(
     points: Float[np.ndarray, "N 3"], neighbors: Any, rows: Int[np.ndarray, "n"]
 ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
-    """Standard deviations of the neighbourhoods of rows, metres, along the normal and along the surface (the smaller
-    one), and the normals. `neighbors` are (N, k) rows, −1 for none."""
+    """Standard deviations of neighbourhoods across and along the surface (the smaller one), metres; and normals."""
     near = neighbors[rows]
     offsets = np.where(near[..., None] >= 0, points[near] - points[rows][:, None], 0)
     offsets -= offsets.mean(axis=1, keepdims=True)
