@@ -104,7 +104,6 @@ def _precision(tree: Any) -> Any:
 def _solved(
     poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int, differentiated: bool
 ) -> tuple[GraphPoses, Any]:
-    """The solution, by a callback if an argument is traced; with a `_Sensitivity` if `differentiated`."""
     dtype, n, line = _precision((poses, factors)), len(poses), calling_line()
 
     def on_host(poses: Any, factors: Any) -> Any:

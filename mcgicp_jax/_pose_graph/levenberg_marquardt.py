@@ -55,13 +55,10 @@ class NormalEquations:
     loops between distant poses would fill the factors.
 
     Attributes:
-        factors: all measurements, numbered in this order, the edges first.
-        rows: (m, 2) rows of the poses of every measurement.
-        in_use: (m,) which measurements are in use.
+        factors: all measurements, numbered in this order, the edges first; `rows` (m, 2) and `in_use` (m,) are theirs.
         place: place of each pose in the elimination order; −1 for `fixed` ones.
         parts: number of the connected part of each pose.
         root: the fixed pose to which covariances refer: the first one, or the world.
-        size: number of unknowns, six per free pose.
         metric: the sparse matrix D at the initial poses.
     """
 
@@ -127,7 +124,6 @@ class NormalEquations:
         return self.gathered(np.stack(sums, axis=1))
 
     def gathered(self, rows: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "_"]:
-        """Rows of the free poses as a vector of the unknowns."""
         vector = np.empty((self.size // 6, *rows.shape[1:]))
         vector[self.place[~self.fixed]] = rows[~self.fixed]
         return vector.reshape(-1)
@@ -169,17 +165,14 @@ def factored(matrix: Any, order: str = "NATURAL") -> Any:
 def normal_blocks(
     jacobians: Float[np.ndarray, "m 2 d 6"], information: Float[np.ndarray, "m d d"]
 ) -> Float[np.ndarray, "m 2 2 6 6"]:
-    """JᵀΛJ of every measurement."""
     weighted = information[:, None] @ jacobians
     return jacobians.swapaxes(2, 3)[:, :, None] @ weighted[:, None]
 
 
 def typical_information(factors: Factors) -> Float[np.ndarray, "m 6"]:
     """Diagonal of S for every measurement: the median over edges of the mean information in translation and rotation.
-
-    For measurements in the world's frame, it is the median over priors: next to motions known to millimetres, positions
-    known to metres would else look unconstrained.
-    """
+    Measurements in the world's frame have the median over priors: next to motions known to millimetres, positions known
+    to metres would else look unconstrained."""
     of_world = np.concatenate([(np.asarray(factor.rows) == WORLD).any(axis=1) for factor in factors])
     means = np.diagonal(np.asarray(factors[0].information), axis1=1, axis2=2).reshape(-1, 2, 3).mean(axis=2)
     typical, priors = np.ones((len(of_world), 2)), of_world[: len(means)]

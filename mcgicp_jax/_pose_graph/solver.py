@@ -205,8 +205,7 @@ def _robust_minimum(equations: lm.NormalEquations, start: lm.Poses, uncertain: l
 
 
 def _wrongly_rejected(state: lm.GraphState, thresholds: lm.PerMeasurement) -> lm.Mask:
-    """Which rejected measurements have a residual within the threshold, given the combined uncertainty of the
-    measurement and of the remaining graph."""
+    """Which rejected measurements pass the threshold given their uncertainty and that of the remaining graph."""
     squares, equations = state.terms.squares, state.equations
     wrong = (state.weights == 0) & (squares > thresholds) & (squares <= _NEAR * thresholds)
     by_factor = map(equations.split, (equations.rows, wrong, thresholds))
@@ -228,10 +227,8 @@ def _wrongly_rejected(state: lm.GraphState, thresholds: lm.PerMeasurement) -> lm
 
 
 def _is_degenerate(state: lm.GraphState, anchors: Edge) -> bool:
-    """Whether poses are not connected, or H along some direction is less than that of `anchors` or than damping.
-
-    Uses the least damping, since that of the last step may be too large to tell.
-    """
+    """Whether poses are not connected, or H along some direction is less than that of `anchors` or than the least
+    damping (that of the last step may be too large to tell)."""
     equations = state.equations
     if np.any(equations.parts != equations.parts[equations.root]):
         return True
