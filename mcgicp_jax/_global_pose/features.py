@@ -75,10 +75,8 @@ def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 
 def comparable(
     histograms: Sequence[Float[np.ndarray, "_ 33"]], statistics: Sequence[Float[np.ndarray, "_ D"]] | None
 ) -> tuple[Float[np.ndarray, "N L"], Float[np.ndarray, "M L"]]:
-    """Features of two clouds on one scale: small integers as float32, whose distances are exact.
-
-    Statistics of channels are divided by their standard deviations in both clouds; missing ones are set to the mean.
-    """
+    """Features of both clouds on one scale, as integers in float32, whose distances are exact. Statistics of channels
+    are divided by their standard deviations in both clouds; missing ones are set to the mean."""
     all_histograms = np.concatenate(histograms).astype(np.float64)
     scale = _DEVIATION / max(float(all_histograms.std()), float(np.finfo(np.float32).tiny))
     center = all_histograms.mean(axis=0)
@@ -99,7 +97,6 @@ def comparable(
 
 
 def _offsets(around: Neighborhoods) -> tuple[Offsets, Float[Array, "k n"]]:
-    """Vectors from the points to their neighbours, metres, and their squared lengths."""
     x, y, z = around.offset(0), around.offset(1), around.offset(2)
     return (x, y, z), x * x + y * y + z * z
 
@@ -211,12 +208,9 @@ def _padded(*columns: Float[np.ndarray, "n 3"]) -> PutativeMatches:
 def mutual_nearest(
     source: Float[np.ndarray, "N L"], target: Float[np.ndarray, "M L"], count: int
 ) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Source and target rows that are nearest to each other in feature space; the most distinctive matches first.
-
-    These have the smallest ratio of the squared distances to the nearest and to the second nearest target row. Ties go
-    to the first row. Features are integers as float32. The search ends when it has `count` matches. It uses no trees,
-    which are no faster in so many dimensions.
-    """
+    """Mutual nearest rows, the most distinctive matches first, by the ratio of the squared distances to the nearest and
+    to the second nearest target row; ties by row. The search ends when it has `count` matches. Trees are no faster in
+    so many dimensions."""
     nearest, squares = _two_nearest(source, target)
     order = np.argsort(squares[:, 0] / np.maximum(squares[:, 1], 1), kind="stable")
     matched = nearest[order, 0]

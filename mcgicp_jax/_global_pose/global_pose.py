@@ -259,7 +259,6 @@ class _Scene(NamedTuple):
     radius: float
 
     def is_near(self, matrix: Float[np.ndarray, "4 4"], points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        """Which points of the source have a point of the target nearby."""
         moved = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
         return nearest_in_position(moved, self.target.points, fit.TOLERANCE * self.voxel_size) >= 0
 

@@ -38,13 +38,8 @@ _FIRST_CONTROL, _GROWTH, _NUM_STEPS = 0.25, 1.4, 12
 
 
 class PutativeMatches(NamedTuple):
-    """Matched points with their normals, padded to `NUM_MATCHES`.
-
-    Attributes:
-        source, target: positions, metres, about their centres.
-        source_normals, target_normals: unit normals of any sign, or zeros where they are not to be compared.
-        valid: False for padding.
-    """
+    """Matches, padded to `NUM_MATCHES`: positions in metres about their centres, and unit normals of any sign, or zeros
+    where they are not to be compared."""
 
     source: Float[AnyArray, "M 3"]
     target: Float[AnyArray, "M 3"]
@@ -101,8 +96,7 @@ def hypotheses(
     Two matches agree if the distance and the angle between their normals are the same in both clouds. The support of
     two matches that agree is the number of matches that agree with both (Chen et al., SC²-PCR, CVPR 2022): two wrong
     matches agree by chance, three seldom do. Each match forms triplets with two of the partners with which it has most
-    support, by a fixed draw. `radius`, metres, is that of the source: a rotation moves points by about its angle times
-    the radius.
+    support, by a fixed draw. `radius` is that of the source, metres.
     """
     support = _support(matches, voxel_size)
     _, partners = jax.lax.top_k(support, _NUM_PARTNERS)
@@ -187,11 +181,8 @@ def squared_separation(turn: Float[AnyArray, "*n 3 3"], shift: Float[AnyArray, "
 
 @jax.jit
 def refined(poses: PoseHypotheses, matches: PutativeMatches, voxel_size: Float[AnyScalar, ""]) -> PoseHypotheses:
-    """Truncated least squares over all matches by graduated non-convexity, from each pose.
-
-    Yang, Antonante, Tzoumas & Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020, eq. 14. Poses
-    with a score of 0 become the identity.
-    """
+    """Truncated least squares over all matches by graduated non-convexity (Yang et al., RA-L 2020, eq. 14), from each
+    pose; the identity for poses with a score of 0."""
     tolerance = TOLERANCE * voxel_size
 
     def fit(rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> tuple[Array, Array]:
