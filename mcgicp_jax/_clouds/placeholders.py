@@ -55,10 +55,13 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
         zero = np.flatnonzero(~places.any(axis=1))
         counts[zero] = max(zeros.size, 1)
         many = np.flatnonzero(counts > _MANY)
-        search = KDTreeSearch(workers=1)
-        _, near = search.query(search.build(places), places[many], min(1 + _NEAR, len(places)), np.inf)
-        # The nearest is the position itself.
-        around = counts[near[:, 1:]].max(axis=1)
+        # At any position; no tree is needed if these are few.
+        around = np.partition(counts, -2)[-2]
+        if many.size > 1 or counts.max() <= _MANY * around:
+            search = KDTreeSearch(workers=1)
+            _, near = search.query(search.build(places), places[many], min(1 + _NEAR, len(places)), np.inf)
+            # The nearest is the position itself.
+            around = counts[near[:, 1:]].max(axis=1)
         repeated = np.zeros(len(counts), bool)
         repeated[many] = counts[many] > _MANY * around
         repeated[zero] = False

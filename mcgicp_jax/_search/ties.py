@@ -83,7 +83,7 @@ class TiedTree:
     def query(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
     ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        """Distances and rows of the tree as from `AbstractTreeSearch.query`, on several threads."""
+        """Distances and rows of the tree as from `TreeBackend.query`, on several threads."""
         count = 1 if self._threads == 1 else min(_PARTS_PER_THREAD * self._threads, len(queries) // _MIN_PART)
         if count <= 1:
             return self._query(self._tree, queries, k, bound)
