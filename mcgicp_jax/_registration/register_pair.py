@@ -386,12 +386,13 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
 
     best = reduce(lambda before, after: after if evident(after, before, BETTER) else before, found)
     common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if little else ""
-    again = f"{common}another registration from the same start, with a smaller max_distance,"
-    reason = f"{again} fails" if little and len(found) == 1 else ""
+    taken = "the result is that of a smaller max_distance, and " if best[0] is not run else ""
+    reason = f"{common}registration with a smaller max_distance fails" if little and len(found) == 1 else ""
     for each in found:
         apart = distance_moved(best[0].loop.state.pose, each[0].loop.state)
         if apart > settings.fine_distance and (little or evident(each, best, 1 / BETTER if few else 1.0)):
-            reason = f"{again} {'ends' if best[0] is run else 'is the result'} {apart:.2g} m away"
+            which = "another" if taken else "a smaller"
+            reason = f"{common}{taken}with {which} max_distance the same initial pose leads {apart:.2g} m away"
             reason = reason if little else f"{reason}, where surfaces coincide about as well"
     return best[0], reason
 
