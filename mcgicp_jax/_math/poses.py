@@ -40,11 +40,9 @@ def pose_matrix(
 ) -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
     """The (4, 4) matrix of a pose: in float64 if the pose is concrete, in its own precision if it is traced.
 
-    A pose is a `jaxlie.SE3`, a (4, 4) matrix or its first three rows; None is the identity. The rotation of a concrete
-    matrix is replaced by the nearest exact one, so that the pose does not scale the cloud.
-
-    Raises `ValueError` for the argument `name` if the shape is wrong; for a concrete pose also if it is no rigid
-    motion, or if its rotation has too few digits for a cloud at this `distance` from the origin, in radii of the cloud.
+    The rotation of a concrete matrix is replaced by the nearest exact one, so that the pose does not scale the cloud.
+    It must have enough digits for a cloud at this `distance` from the origin, in radii of the cloud. Errors
+    (`ValueError`) begin with `name`.
     """
     if pose is None:
         return np.eye(4)
@@ -176,7 +174,6 @@ def rotation_from_quaternion(wxyz: Float[np.ndarray, "*batch 4"]) -> Float[np.nd
 
 
 def rotated(points: Float[np.ndarray, "n 3"], rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "n 3"]:
-    """R p of each point p."""
     # Not `points @ rotation.T`: the threads of BLAS keep their cores busy for a while after each product, which was a
     # third of the processor time of odometry.
     return np.einsum("ij,jn->in", rotation, np.ascontiguousarray(points.T)).T
@@ -262,7 +259,6 @@ def translation_adjoint(offset: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
 
 
 def skew(vectors: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3 3"]:
-    """Matrices of the cross products a × ·."""
     xp = numpy_for(vectors)
     x, y, z = xp.moveaxis(vectors, -1, 0)
     zero = xp.zeros_like(x)
@@ -277,7 +273,6 @@ _ZETA = np.array([np.pi**2 / 6, np.pi**4 / 90, *(np.sum(np.arange(1.0, 999) ** (
 
 
 def exponential(twists: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*batch 4 4"]:
-    """exp(ξ)."""
     omega = skew(twists[..., 3:])
     square = omega @ omega
     angle = np.linalg.norm(twists[..., 3:], axis=-1)[..., None, None]

@@ -33,7 +33,7 @@ class Numbers(eqx.Module):
 
 
 def number_of(name: str, value: Any) -> Array:
-    """The value of the parameter `name` as an array, in the default precision; raises `ValueError` if it is none."""
+    """`value` as an array in the default precision; `ValueError` for the parameter `name` if it is no number."""
     try:
         # NumPy converts concrete values without compiling a program.
         return put_on_cpu(np.asarray(value, canonical_float())) if is_concrete(value) else jnp.asarray(value)
@@ -132,11 +132,8 @@ class Tukey(AbstractKernel):
 
 
 def truncated_weights(ratio: Float[AnyArray, "*batch"], control: AnyScalar) -> Float[AnyArray, "*batch"]:
-    """Weights of truncated squares in graduated non-convexity (Yang et al., RA-L 2020, eq. 14).
-
-    `ratio` is the threshold divided by the residual; `control` is μ: the larger, the steeper is the decline from 1 to 0
-    around the threshold.
-    """
+    """Weights of truncated squares in graduated non-convexity (Yang et al., RA-L 2020, eq. 14): `ratio` is the
+    threshold over the residual; the larger `control`, μ, the steeper they fall from 1 to 0 around the threshold."""
     xp = numpy_for(ratio, control)
     return xp.clip(ratio * xp.sqrt(control * (control + 1)) - control, 0, 1)
 

@@ -21,8 +21,7 @@ _BITS = np.uint64(0x9E3779B97F4A7C15)
 
 
 def sampled_rows(valid: Any, most: int = MEDIAN_ROWS) -> tuple[Any, Any]:
-    """At most `most` evenly spaced rows of a cloud, such as the sample for a median, and which of them are valid.
-    `valid` is (N,), False for padding, which comes last."""
+    """At most `most` evenly spaced rows of a cloud whose padding comes last, and which of them are valid."""
     xp = numpy_for(valid)
     count = min(valid.size, most)
     rows = xp.arange(count) * (1 + xp.sum(valid) // most)
@@ -32,11 +31,11 @@ def sampled_rows(valid: Any, most: int = MEDIAN_ROWS) -> tuple[Any, Any]:
 
 
 def spread_rows(valid: Any, count: int) -> Any:
-    """`count` valid rows of a cloud with more rows than that, in order: one from each of `count` equal runs.
+    """One valid row from each of `count` equal runs of a larger cloud, in order; if too few are valid, padding follows.
 
-    Rows sorted by voxel, as `preprocess` leaves them, are spread evenly in space, others as densely as the points. The
-    place in each run is random with a fixed seed: with a constant stride, all rows of an organised scan could be from
-    one scan line. `valid`, (N,), is False for padding; if fewer than `count` are True, rows of padding follow.
+    Rows sorted by voxel, as `preprocess` leaves them, are spread evenly in space, others as densely as the points.
+    Places in the runs are random, with a fixed seed: at a constant stride, all rows of an organised scan could be from
+    one line.
     """
     xp = numpy_for(valid)
     valid_first = xp.argsort(~xp.asarray(valid), stable=True)
@@ -99,8 +98,7 @@ def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, "
 
 
 def upper_median(values: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch"]:
-    """The median, or of an even number of values the larger one of the two in the middle. For a few values, NumPy's
-    median takes three times as long."""
+    """The median; of an even number of values, the upper middle one. For few values, three times as fast as NumPy's."""
     middle = values.shape[-1] // 2
     return np.partition(values, middle)[..., middle]
 
