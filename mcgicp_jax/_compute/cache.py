@@ -68,11 +68,9 @@ _clouds = Cache(MAX_ROWS, lambda cached: cached.num_rows)
 
 
 def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Parameters, Value]:
-    """Decorator of functions whose first argument is a cloud. The key of a result is the cloud, by identity, and all
-    other arguments, pytrees that are compared by value: nothing that the result depends on can be missing in it.
+    """Decorator: cache results with their cloud, the first argument; others are pytrees, compared by value.
 
-    Values live no longer than their cloud, any object with `points` that can be referenced weakly, unless they refer to
-    it themselves.
+    The cloud counts by identity, and values live no longer than it does, unless they refer to it themselves.
     """
 
     @wraps(compute)
@@ -108,7 +106,6 @@ class Lazy(Generic[Value]):
 
     @classmethod
     def of(cls, value: Value) -> Lazy[Value]:
-        """A `Lazy` whose value is known already."""
         return cls.tree_unflatten(None, (value,))
 
     @property

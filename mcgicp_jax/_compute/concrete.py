@@ -27,13 +27,11 @@ else:
 
 
 class Deferred:
-    """A concrete array that is computed when it is needed. As a pytree it is the whole array: what JAX passes through a
-    transformation, copies or pickles is computed first."""
+    """A concrete array that is computed when needed: JAX's transformations, copies and pickles get all of it."""
 
     # Not an `abc.ABC`, for whose subclasses `isinstance` takes ten times as long: it is asked of every array.
     @property
     def whole(self) -> np.ndarray:
-        """The array."""
         raise NotImplementedError
 
     def tree_flatten(self) -> tuple[tuple[np.ndarray], None]:
@@ -91,10 +89,7 @@ def canonical_float() -> Any:
 
 
 def numpy_for(*trees: object) -> ModuleType:
-    """NumPy if every array is concrete, so that nothing is compiled; `jax.numpy` if one is traced.
-
-    It lets formulas that run both on the host and inside transformations be written once.
-    """
+    """NumPy if every array is concrete, so that nothing is compiled; `jax.numpy` if one is traced."""
     return np if is_concrete(*trees) else jnp
 
 

@@ -26,10 +26,7 @@ def on_accelerator() -> bool:
 
 
 def on_cpu() -> contextlib.AbstractContextManager[Any]:
-    """Context in which JAX computes on the CPU.
-
-    Programs between host code are small: a GPU would spend most of the time on launches and transfers.
-    """
+    """Context in which JAX computes on the CPU: with small programs, a GPU mostly launches and transfers."""
     if on_accelerator():
         # `jax_platforms` may leave the CPU out.
         with contextlib.suppress(RuntimeError):
@@ -38,8 +35,6 @@ def on_cpu() -> contextlib.AbstractContextManager[Any]:
 
 
 def computed_on_cpu(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
-    """Decorator of functions in which JAX computes on the CPU."""
-
     @functools.wraps(function)
     def computed(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
         # To enter a context takes longer than to ask.

@@ -22,8 +22,7 @@ from mcgicp_jax._compute.threads import in_new_thread, side_by_side, with_settin
 
 
 class AbstractLinearMap(abc.ABC):
-    """The derivative of some values by some inputs, in NumPy. The first axis of all arrays counts the tangents or
-    cotangents."""
+    """The derivative of values by inputs, in NumPy. The first axis of all arrays counts the tangents or cotangents."""
 
     @abc.abstractmethod
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
@@ -75,10 +74,7 @@ class SideBySide(AbstractLinearMap):
 
 
 def primal(tree: Any) -> Any:
-    """The tree with tracers of `grad` and `jvp` replaced by their values, NumPy arrays.
-
-    Tracers of `jit` and `vmap` have no values and remain, as concrete arrays do.
-    """
+    """The tree with NumPy values in place of tracers of `grad` and `jvp`. Tracers of `jit` and `vmap` remain."""
 
     def value(leaf: Any) -> Any:
         if is_concrete(leaf):
@@ -120,13 +116,8 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
 
 
 class RowAverage(AbstractLinearMap):
-    """Each row of the result is the mean of some rows.
-
-    Args:
-        rows, groups: which row counts in which row of the result.
-        counted: (n, C) or (n, 1), which of its entries count.
-        sizes: numbers of rows of the array and of the result.
-    """
+    """Averages of groups of rows: `rows[i]` counts in row `groups[i]` of the result, with those of its entries that are
+    `counted`, (n, C) or (n, 1). `sizes` are the numbers of rows of the array and of the result."""
 
     def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], counted: Any, sizes: tuple[int, int]):
         ones = np.ones(len(rows))
@@ -237,8 +228,7 @@ mlir.register_lowering(_linear, _not_compiled)
 
 
 def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
-    """The arrays of a tree, which depend on `inputs`, but have no derivative by them: reverse mode raises
-    `NotImplementedError` with the message where it would use it, and forward mode gives NaN."""
+    """The tree, whose derivative by `inputs` is refused: an error where reverse mode uses it, NaN in forward mode."""
     if is_concrete(inputs):
         return tree
     leaves = jax.tree.leaves(inputs, is_leaf=is_deferred)

@@ -81,7 +81,6 @@ def optional_module(module: str, extra: str, use: str) -> Any:
 
 
 def check_concrete(name: str, *values: object) -> None:
-    """Raise `ValueError` for arguments that are traced, of functions that run outside of transformations alone."""
     if not is_concrete(*values):
         raise ValueError(f"{name}: expected concrete arrays, got tracers; call this outside of jit, vmap and grad")
 

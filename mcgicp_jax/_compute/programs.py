@@ -51,9 +51,8 @@ _QUICK: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
 def quickly_compiled(function: Callable[..., Result], *, level: int | None = None) -> Callable[..., Result]:
     """`jax.jit` of a function that is called outside of other transformations; it runs on the CPU.
 
-    Args:
-        level: of LLVM's optimizations, for programs of a few small matrices: without (0), they compile in half the
-            time, and with few (1), they also run as fast as with all.
+    At `level` 0 of LLVM's optimizations, programs of a few small matrices compile in half the time; at 1, they also run
+    as fast as with all.
     """
     options = _QUICK if level is None else {**_QUICK, "xla_backend_optimization_level": level}
 
@@ -97,11 +96,6 @@ def call_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any
     of as many programs as there are threads wait for such copies, they deadlock (seen with two programs on two cores).
     So large arrays are passed in pieces, and a batch of lanes, whose pieces would be large again, is not passed at
     once. The function must not call JAX, which was seen to deadlock as well.
-
-    Args:
-        function: maps pytrees of NumPy arrays to a pytree of arrays.
-        shapes: the pytree of its results, as `jax.ShapeDtypeStruct`.
-        arguments: pytrees of arrays.
     """
     leaves, structure = jax.tree.flatten(arguments)
     pieces = [_pieces(leaf) for leaf in leaves]
@@ -114,7 +108,6 @@ def call_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any
 
 
 def _pieces(array: Any) -> list[Any]:
-    """An array split along its rows into pieces of at most `_LARGEST_PIECE` bytes."""
     array = jnp.asarray(array)
     count = -(-array.nbytes // _LARGEST_PIECE)
     return [array] if count <= 1 else jnp.array_split(array, count)

@@ -103,13 +103,8 @@ class GivenTable:
 class RowFunction:
     """A row function with its arguments, on the host.
 
-    Args:
-        function: pure JAX, at module level or cached, since its programs are kept for it. It returns a sum, a
-            pytree, or a tuple of pytrees of arrays with one row each.
-        numbers: a pytree of arrays.
-        inputs: the tables.
-        size: number of rows.
-        total: whether it returns a sum, to which rows with the index −1 must not add.
+    `function` is defined at module level or cached, since its programs are kept for it. It returns a sum, a pytree, or
+    a tuple of pytrees of arrays with one row each. Rows with the index −1 must not add to a sum (`total`).
     """
 
     def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, total: bool = False):
@@ -137,11 +132,9 @@ class RowFunction:
 
     @property
     def tracers(self) -> list[Any]:
-        """The arrays that differentiation traces."""
         return [array for array in self.arrays.values() if not is_concrete(array)]
 
     def rows(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
-        """The trees of rows; of all rows by default."""
         found = self._over_blocks(rows, num_threads)
         layouts = [part.layout for part in found[0][1]]
         size = found[-1][0].stop
@@ -152,7 +145,7 @@ class RowFunction:
         return tuple(map(Packed, tables, layouts))
 
     def sums(self, num_threads: int | None = 1, packed: bool = True) -> list[Any]:
-        """The sum over each block, packed if that is not declined; programs may not have ended."""
+        """The sum over each block. Programs may not have ended."""
         return [part for _, part in self._over_blocks(None, num_threads, packed)]
 
     @with_settings_of_package
@@ -181,12 +174,8 @@ class RowFunction:
         return [into.get(id(leaf), np.zeros((count, *np.shape(leaf)))) for leaf in leaves]
 
     def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> None:
-        """Add the cotangents of what is moving to `into`.
-
-        Args:
-            cotangents: (c, L) of the sum, packed, or (N, c, L) of the rows.
-            rows: those whose cotangents are not 0; None for all.
-        """
+        """Add to `into` the cotangents of what is moving, from those of the packed sum, (c, L), or of the rows, (N, c,
+        L), which are 0 but for `rows` (None: any may differ)."""
         numbers, *columns = chosen = self._chosen(moving)
         if not any(chosen):
             return
@@ -216,8 +205,7 @@ class RowFunction:
             self._inputs[j].table.vjp(slope, moving, into, gathered.used(j))
 
     def jvp(self, tangents: Slopes, moving: Moving, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
-        """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of what is moving. A scalar
-        0 if it does not depend on that."""
+        """Tangents of the packed sum, (c, L), or of the rows, (n, c, L); a scalar 0 if it depends on nothing moving."""
         numbers, *columns = chosen = self._chosen(moving)
         if not any(chosen):
             return np.zeros(())
@@ -266,12 +254,8 @@ class RowFunction:
 class ComputedTable(RowFunction):
     """The result of a row function, whose rows are computed when they are first used. Threads may share it.
 
-    Tangents and cotangents are those of the `columns` that move alone.
-
-    Args:
-        function, numbers, inputs, size: as of `RowFunction`; the function returns a tuple of trees, of which those
-            after the first are constants to autodiff.
-        values: a table with the same values, from which rows are taken.
+    Trees after the first are constants to autodiff; tangents and cotangents are those of the `columns` that move alone.
+    `values` is a table with the same values, from which rows are taken.
     """
 
     def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, values: Any = None):
@@ -399,7 +383,6 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
 
 
 def size_of(first: Input) -> int:
-    """The number of rows of a result, from its first input."""
     if first.index is not None:
         return len(first.index)
     return first.table.size if isinstance(first.table, Table) else len(jax.tree.leaves(first.table)[0])
@@ -466,8 +449,8 @@ def _found(given: Input) -> Input:
 
 
 def whole(given: Input, rows: Any = None, spread: bool = False) -> Rows:
-    """All rows, or some, of a pytree of arrays, some of which are traced. Where there is none it is the first, or with
-    `spread` that of the same number: GPUs add the cotangents of a row, zeros included, one after the other."""
+    """All rows, or some, of a pytree. For the index −1, the first row, or with `spread` that of the same number: GPUs
+    add the cotangents of a row, zeros included, one after the other."""
     tree, index = jax.tree.map(jnp.asarray, given.table), given.index
     size = len(jax.tree.leaves(tree)[0])
     if index is None and rows is None:
@@ -491,8 +474,7 @@ def _add_rows(
 
 @cache
 def _program(function: Callable[..., Any], total: bool, packed: bool) -> Callable[..., Any]:
-    """A row function for a block, with packed arguments and results: to pass dozens of arrays takes longer than to use
-    them."""
+    """A row function for a block, packed: to pass dozens of arrays takes longer than to use them."""
 
     def program(numbers: Any, packs: Any, indices: Any) -> Any:
         found = function(numbers, *(Rows(pack.tree, index) for pack, index in zip(packs, indices, strict=True)))
@@ -527,7 +509,7 @@ def _of_chosen(
 
 @cache
 def _vjp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
-    """The vector-Jacobian product of a block for several cotangents: of the chosen numbers, (c, ...), and of the chosen
+    """The vector-Jacobian product of a block for c cotangents: of the chosen numbers, (c, ...), and of the chosen
     columns of each input side by side, (c, n, W) or (c, k, n, W); None where there are none."""
 
     def program(numbers: Any, packs: Any, indices: Any, cotangents: Any) -> Any:
@@ -546,8 +528,7 @@ def _vjp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> C
 
 @cache
 def _jvp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
-    """The Jacobian-vector products of a block, (c, L) or (c, n, L), for several tangents, shaped as the results of
-    `_vjp_program`."""
+    """Jacobian-vector products of a block, (c, L) or (c, n, L); tangents are shaped as results of `_vjp_program`."""
 
     def program(numbers: Any, packs: Any, indices: Any, by_numbers: Any, by_rows: Any) -> Any:
         result, here = _of_chosen(function, total, chosen, numbers, packs, indices)

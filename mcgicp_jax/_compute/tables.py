@@ -18,13 +18,7 @@ Tree = TypeVar("Tree")
 
 
 class Layout(NamedTuple):
-    """How a tree of arrays lies in one.
-
-    Attributes:
-        structure: of the tree.
-        shapes: of each array, without the axes that they share.
-        dtypes: of each array; None if it is that of the table.
-    """
+    """How a tree of arrays lies in one table. `shapes` lack shared axes; a dtype like the table's is None."""
 
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
@@ -34,12 +28,7 @@ class Layout(NamedTuple):
 @partial(jax.tree_util.register_dataclass, data_fields=("table",), meta_fields=("layout",))
 @dataclass(frozen=True)
 class Packed(Generic[Tree]):
-    """A tree of arrays in one; a pytree, whose layout is static.
-
-    Attributes:
-        table: (..., L). Its dtype is that of the floats, if there are any; integers up to 2²⁴ and booleans are exact in
-            it.
-    """
+    """A tree of arrays in one, (..., L), with the dtype of its floats: integers are exact in it up to 2²⁴."""
 
     table: Any
     layout: Layout
@@ -72,7 +61,6 @@ class Packed(Generic[Tree]):
         return jax.tree.unflatten(self.layout.structure, leaves)
 
     def rows(self, index: Any) -> Packed[Tree]:
-        """Some rows of a NumPy array."""
         # `take` takes a quarter of the time of an index array.
         table = self.table[index] if isinstance(index, slice) else self.table.take(index, axis=0)
         return Packed(table, self.layout)
@@ -81,10 +69,8 @@ class Packed(Generic[Tree]):
 class RowsOnDemand(Generic[Tree]):
     """A pytree of arrays, each row of which is computed once, when it is first needed. Threads may share it.
 
-    Args:
-        compute: maps row numbers, or None for all rows, and the largest number of threads to a pytree of NumPy arrays.
-            A row must not depend on the others that are computed with it.
-        num_rows: number of rows, at least 1.
+    `compute` maps row numbers, or None for all rows, and the largest number of threads to NumPy arrays. A row must not
+    depend on the others that are computed with it.
     """
 
     def __init__(self, compute: Callable[[Any, int | None], Tree], num_rows: int):
@@ -133,12 +119,7 @@ Block = tuple[slice, slice | Int[np.ndarray, "BLOCK"]]
 
 
 def blocks(num_rows: int, size: int = BLOCK) -> list[Block]:
-    """Cut rows into blocks.
-
-    Returns:
-        For each block, the slice of rows that it covers, and an index that selects exactly `size` rows: the last block
-        is padded by repeating the last row.
-    """
+    """For each block, its slice of rows, and an index of exactly `size` rows that repeats the last row as padding."""
     whole = [slice(start, start + size) for start in range(0, num_rows - size + 1, size)]
     cut: list[Block] = [(part, part) for part in whole]
     start = len(whole) * size

@@ -38,9 +38,8 @@ _OPEN = {None, "allow"}
 def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
     """Decorator of functions in which JAX has the settings that the package needs, whatever users chose for their code.
 
-    Optional checks are off: `debug_nans` and `debug_infs`, since NaN marks missing values here, strict promotion of
-    dtypes and ranks, and guards of transfers, since the host computes between programs. Products of matrices are in
-    full precision: by default, GPUs round factors to 11 bits (TF32), that is 5 cm at 100 m.
+    NaN marks missing values here, and the host computes between programs. Products of matrices are in full precision:
+    by default, GPUs round factors to 11 bits (TF32), that is 5 cm at 100 m.
     """
 
     @functools.wraps(function)
@@ -86,15 +85,12 @@ def num_cores() -> int:
 
 
 def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None = None) -> list[Answer]:
-    """Run calls in parallel and return their results in order. The calling thread runs the first call itself.
+    """Run one or more calls in parallel; the results are in order. The calling thread runs the first call itself.
 
     The other threads belong to a persistent pool of the process: a new thread starts on its parent's core, and most
     queries end before the scheduler moves it to another. Idle threads take the next call from a queue, so that no call
     waits for a thread that is late or blocked. An error of a call is raised once all started calls have ended.
-
-    Args:
-        calls: at least one function without arguments.
-        max_threads: largest number of threads, including the calling one; one per call by default.
+    `max_threads` includes the calling one.
     """
     if len(calls) == 1:
         return [calls[0]()]
@@ -130,16 +126,13 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
 
 
 def in_new_thread(call: Callable[[], Answer]) -> Answer:
-    """The result of a call in a thread of its own, where no transformation of this one is active.
-
-    While one is, as inside `jax.grad`, each call of a compiled program takes half a millisecond longer.
-    """
+    """The result of a call in a thread of its own, without the transformations that are active in this one: inside
+    `jax.grad`, say, each call of a compiled program takes half a millisecond longer."""
     return started(call).result()
 
 
 def started(call: Callable[[], Answer]) -> Future[Answer]:
-    """The future result of a call that begins now, in a thread of its own, for which the interpreter does not wait when
-    it ends: a source of frames may block for ever."""
+    """The future result of a call in a daemon thread of its own, since a source of frames may block for ever."""
     future, bound = Future[Answer](), with_settings(call)
 
     def work() -> None:
@@ -153,12 +146,9 @@ def started(call: Callable[[], Answer]) -> Future[Answer]:
 
 
 class ReadAhead(Iterator[Answer]):
-    """The results of a function, called anew while the last result is in use, in a thread: one ahead, no further.
+    """The results of `read` until it raises `StopIteration`; a thread reads one ahead while the last one is in use.
 
     An error is raised in the place of its result, and the iteration may go on.
-
-    Args:
-        read: returns the next result; raises `StopIteration` at the end.
     """
 
     def __init__(self, read: Callable[[], Answer]):
@@ -176,12 +166,10 @@ class ReadAhead(Iterator[Answer]):
 
 
 def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Callable[..., Answer]:
-    """The function bound to the JAX settings of this thread, which are thread-local, for calls in another one. Warnings
-    are shown at the line that called the package here.
+    """The function with this thread's JAX settings and line of warnings, for calls in another thread.
 
-    Args:
-        pickled: whether the function goes to another process. Devices cannot be sent there, so that process uses the
-            first device of the same platform; nor can the line.
+    `pickled` functions go to another process, to which neither devices nor the line can be sent: there, the first
+    device of the same platform is used.
     """
     if not pickled:
         return functools.partial(_run_with, _settings(), shown_at(calling_line())(work))
