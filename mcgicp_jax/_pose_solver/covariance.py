@@ -93,18 +93,13 @@ def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:
 def discounts_and_radius(
     sample: NoiseSample, num_channels: Int[AnyScalar, ""]
 ) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
-    """(2,) factors, 0.2 to 1, by which observability must be reduced: of the geometry and of the channels; and the
-    median distance to the farthest neighbour, metres.
+    """Factors, 0.2 to 1, that reduce observability by geometry and by channels; median neighbourhood radius.
 
     On a rough surface the nearest neighbour is one whose height resembles that of the point. Model the height b of a
     match as b = βa + e, with equal roughness on both sides. Then var(b − a) is (1 − β) times the sum of both
     roughnesses, and the match follows a fraction β of any motion. The ratio of observed to expected variance therefore
     estimates the observable fraction 1 − β. The same holds for noisy channels. Medians, since the plane fits fail at
-    edges.
-
-    Args:
-        sample: of matches.
-        num_channels: number of channels with a nonzero weight α.
+    edges. `num_channels` counts those with a nonzero weight α.
     """
     xp = numpy_for(sample, num_channels)
     seen, expected, quotient, neighborhood_radius = median(xp.stack([xp.asarray(column) for column in sample]))
@@ -118,11 +113,9 @@ def discounts_and_radius(
 
 
 class Scores(NamedTuple):
-    """Scores of n correspondences, and the sums over them that `sandwich` needs.
+    """Forces and torques of correspondences (arms in units of the radius), and sums over them for `sandwich`.
 
     Attributes:
-        wrenches: force and torque (arms in units of the radius).
-        valid: 1 for valid correspondences, else 0.
         cells: number of the cell of each correspondence; None: each is a cell of its own.
         jacobian: Σ (K O) ⊗ h hᵀ about the centre, K O symmetrised; K = w M, or the tangent of a robust force.
         bias: Σ of force and torque of w M(I − O)d; 0 where observability is not known.
@@ -136,13 +129,8 @@ class Scores(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """Centre of the torques, and the other inputs of the scores besides the correspondences.
-
-    Attributes:
-        center, radius: `Sums.center` and `Sums.radius` over all correspondences, metres.
-        discount, neighborhood_radius: from `discounts_and_radius`.
-        num_cells: size of the hash table of cells.
-    """
+    """What scores depend on besides correspondences: `Sums.center` and `Sums.radius` over all of them, the results of
+    `discounts_and_radius`, and the size of the hash table of cells."""
 
     center: Float[AnyArray, "3"]
     radius: Float[AnyScalar, ""]
@@ -160,9 +148,8 @@ def scores_of(
 ) -> Scores:
     """The scores of correspondences at a pose; O = I for surfaces without `noise`.
 
-    Args:
-        responding: the terms with their response (`AbstractAdaptiveTerm.with_response`). Their stiffness replaces K O,
-            and their forces replace w M O d. None for terms that do not adapt, and where matches are fixed.
+    `responding` are the terms with their response (`AbstractAdaptiveTerm.with_response`), whose stiffness replaces K O,
+    and whose forces replace w M O d. None for terms that do not adapt, and where matches are fixed.
     """
     posed, total, counts = linearize_at(motion, matched, terms)
     moved = posed.moved
@@ -206,7 +193,6 @@ def _discounted_observability(
 
 
 def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
-    """Force and torque of forces acting at the ends of arms."""
     return jnp.concatenate([force, jnp.cross(arms, force, axis=0)])
 
 
@@ -233,14 +219,8 @@ def _cells(
 
 
 class Moments(NamedTuple):
-    """Sums over the scores of all correspondences.
-
-    Attributes:
-        jacobian, bias: see `Scores`.
-        scatter: Σ_c u_c u_cᵀ.
-        num_cells: number of cells with valid correspondences.
-        rounding: covariance of positions since coordinates are rounded to coarse steps, metres².
-    """
+    """Sums over the scores of all correspondences: those of `Scores`, Σ_c u_c u_cᵀ, and the number of cells with valid
+    ones. `rounding` is the covariance of positions since coordinates are rounded to coarse steps, metres²."""
 
     jacobian: Float[AnyArray, "6 4 4"]
     bias: Float[AnyArray, "6"]
@@ -250,7 +230,6 @@ class Moments(NamedTuple):
 
 
 def moments_from(scores: Scores, num_cells: int) -> Moments:
-    """Sums over scores, by NumPy if they are NumPy arrays."""
     xp = numpy_for(scores)
     rows = xp.concatenate([scores.wrenches, scores.valid[:, None]], axis=1)
     if scores.cells is not None and xp is np:

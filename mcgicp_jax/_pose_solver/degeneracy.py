@@ -97,12 +97,8 @@ class Directions(eqx.Module):
 
 def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) -> Directions:
     """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
-    geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
-
-    Args:
-        constraints: rows that are orthogonal to the free twists, and rows of zeros. Eigenvectors are those within the
-            free twists; the other directions are fixed. None if all are free.
-    """
+    geometry does not constrain, by the channels. Fractions do not depend on units or on the origin. Twists orthogonal
+    to the rows of `constraints`, which may be 0, are free; the other directions are fixed."""
     if sums.mass is None or sums.observability is None:
         raise ValueError("sums: expected those of surfaces with observability")
     center, radius = sums.center, sums.radius
@@ -209,9 +205,7 @@ def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirec
 
 def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
     """Orthogonal matrix that mixes motions so that translations come first, along coordinate axes where possible.
-
-    Orthogonal mixing keeps the motions orthogonal in the mean motion of the points.
-    """
+    Motions stay orthogonal in the mean motion of the points."""
     if not len(motions):
         return np.zeros((0, 0))
     mixing = np.linalg.svd(motions[:, 3:])[0].T[::-1]

@@ -47,8 +47,8 @@ def constrained_by_pose_form(directions: Directions, information: Float[Array, "
 def fuse(
     pose: jaxlie.SE3, center: Float[Array, "3"], directions: Directions, moments: Moments, form: PoseForm
 ) -> Fusion:
-    """The equation of the pose, from the final pose of a first registration, see `register`: its `Sums.center`, its
-    directions as in the loop, and the moments of its scores. `form` refers to that pose and centre."""
+    """The equation of the pose from the end of a first registration, see `register`: its pose and `Sums.center`, to
+    which `form` refers, its directions as in the loop, and the moments of its scores."""
     radius = jnp.asarray(directions.radius)
     rotation, translation = pose.rotation().as_matrix().astype(radius.dtype), pose.translation()
     nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)

@@ -31,12 +31,10 @@ class ImplicitRoot(eqx.Module):
     derivative of the pose follows from g, including the dependence of M and w on the pose.
 
     Where directions are unconstrained, the loop converges to a root of Pᵀ g: the columns of P are twists along the
-    constrained directions, and the pose moves along these alone, as in `solve_update`. P is a constant to autodiff, as
-    the matches are: what it contributes is the forces along unconstrained directions, which are arbitrary, times its
-    own change.
+    constrained directions, and the pose moves along these alone, as in `solve_update`. P is constant to autodiff, as
+    the matches are: its own change is multiplied by forces along unconstrained directions, which are arbitrary.
 
     Attributes:
-        center, radius: `Sums.center` and `Sums.radius` at the returned pose, metres.
         scale: tr(Σ K) · radius²; g is divided by it to be dimensionless.
         usable: whether a root is to be searched; if False, the derivative is zero.
         columns: P, lengths in units of the radius, with zeros for unconstrained directions. If there are none, I.
@@ -63,8 +61,7 @@ def root_near(
     constrained: Bool[AnyArray, "6"],
     fusion: Fusion | None,
 ) -> ImplicitRoot:
-    """The scaling of g, from the sums at the returned pose or from `Fusion`. Columns of `basis` are twists about the
-    centre, lengths in units of the radius; `constrained` says which of them are constrained."""
+    """The scaling of g at the returned pose; columns of `basis` are twists, lengths in units of the radius."""
     identity, degenerate = jnp.eye(6, dtype=sums.center.dtype), usable & ~jnp.all(constrained)
     columns = jnp.where(degenerate, basis * constrained, identity)
     if fusion is not None:
@@ -87,15 +84,10 @@ class Model(NamedTuple):
 
 @jax.custom_jvp
 def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "7"]:
-    """Return the pose, with the derivative −P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ ∂g/∂θ of the nearby root of Pᵀ g (implicit function
-    theorem).
+    """The pose, with the derivative −P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ ∂g/∂θ of the nearby root of Pᵀ g by θ, the `model`.
 
-    The derivative is evaluated at the root, which Newton's method finds from the pose. It is zero if `root.usable` is
-    False or Newton's method does not converge. A second derivative raises `NotImplementedError`.
-
-    Args:
-        pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
-        model: θ, the differentiable inputs.
+    It is evaluated at the root, which Newton's method finds from the pose, and zero if `root.usable` is False or
+    Newton's method does not converge. A second derivative raises `NotImplementedError`.
     """
     return pose
 
@@ -174,8 +166,7 @@ def value_and_jacobian(
 
 
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
-    """`score_at` a pose moved to first order along a twist (in units of the radius); with tie points or a prior,
-    `Fusion.balance`."""
+    """`score_at`, or `Fusion.balance`, at a pose moved to first order along a twist (in units of the radius)."""
     matched, terms, fusion = model
     score = score_at(_moved(twist, pose, root), root, matched, terms)
     return score if fusion is None else balance_along(twist, pose, root, score, fusion)

@@ -25,11 +25,7 @@ from mcgicp_jax._terms.base import AbstractAdaptiveTerm, AbstractTerm, Lineariza
 
 
 class Motion(NamedTuple):
-    """A pose as rotation matrix and translation vector.
-
-    Attributes:
-        rotation, translation: parts of T_target_source; the latter in metres.
-    """
+    """T_target_source as a rotation matrix and a translation vector, metres."""
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]
@@ -44,20 +40,16 @@ class Motion(NamedTuple):
         return Motion(jaxlie.SO3(parameters[:4]).as_matrix().astype(dtype), parameters[4:])
 
     def move(self, points: Float[AnyArray, "n 3"]) -> Float[AnyArray, "3 n"]:
-        """T a for each point, metres."""
         if isinstance(self.rotation, np.ndarray) and isinstance(points, np.ndarray):
             return (rotated(points, self.rotation) + self.translation).T
         return jnp.dot(self.rotation, jnp.asarray(points).T, precision="highest") + self.translation[:, None]
 
 
 class Matches(NamedTuple):
-    """Candidates in the target for n source points.
+    """Target rows of m candidates for n source points; −1 where there is none, or a point does not count.
 
-    Attributes:
-        indices: target rows of the m candidates; −1 where there is none, or a point does not count.
-        max_distance: metres; applied when the matches are used, so that they may follow a pose.
-        rows: the source points among all rows; None for all of them.
-        temperature: of a soft assignment, metres; None without one.
+    `max_distance`, metres, is applied when the matches are used, so that they may follow a pose. `rows` are the source
+    points among all rows; None: all. `temperature` is that of a soft assignment, metres.
     """
 
     indices: Int[AnyArray, "m n"]
@@ -87,19 +79,13 @@ class Matches(NamedTuple):
         return Matches(indices.reshape(-1, indices.shape[-1]), infinite, temperature=temperature)
 
     def some(self, rows: Int[AnyArray, "n"]) -> Matches:
-        """Those of some of the source points."""
         return self._replace(indices=self.indices[:, rows], rows=rows if self.rows is None else self.rows[rows])
 
 
 class Matched(eqx.Module):
-    """Both sides of n correspondences; n = m N for m candidates of N source points.
+    """Both sides of n = m N correspondences, m candidates of N points: the first ones of all points come first.
 
-    Attributes:
-        source, target: rows of the surfaces; the first candidates of all source points come first.
-        valid: (n,) False for correspondences to ignore.
-        descriptor_distances: (n,) squared distances of descriptors α · channel, metres²; only for soft assignment.
-        temperature: of the soft assignment, metres; None otherwise.
-        num_candidates: m.
+    Soft assignment alone has `descriptor_distances`, squared, of α · channel, metres², and a `temperature`, metres.
     """
 
     source: Surface
@@ -110,7 +96,6 @@ class Matched(eqx.Module):
     num_candidates: int = eqx.field(static=True, default=1)
 
     def at(self, motion: Motion) -> PosedMatches:
-        """The matches at a pose."""
         moved = motion.move(self.source.points)
         return PosedMatches(self.source, self.target, moved, motion.rotation, self.valid)
 
@@ -144,8 +129,7 @@ def inputs_of(
 
 @cache
 def of_matches(function: Callable[..., Any], with_noise: bool, total: bool = True) -> Callable[..., Any]:
-    """A function of a motion, `Matched` and further arguments as a row function of `inputs_of`. If it returns rows
-    (not `total`), these are the only tree of the result."""
+    """A function of a motion, `Matched` and others as a row function of `inputs_of`: a sum, or one tree of rows."""
 
     def of_rows(numbers: tuple[Motion, Any, Any, tuple[Any, ...]], *rows: Rows) -> Any:
         motion, max_distance, temperature, arguments = numbers
@@ -228,8 +212,7 @@ def adapted(
     valid: Bool[AnyArray, "N"],
     sample: Callable[[AbstractAdaptiveTerm, Int[AnyArray, "n"]], Any],
 ) -> tuple[AbstractTerm, ...]:
-    """The terms with their numbers estimated; constants to autodiff. `valid` is False for padding of the source, and
-    `sample` computes `sample_of_term` for the matches of some source points."""
+    """The terms with numbers estimated, constants to autodiff; `sample` is `sample_of_term` for some source points."""
     rows, counts = sampled_rows(valid)
     xp = numpy_for(counts, valid)
     fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)
@@ -249,5 +232,4 @@ def adapted(
 
 
 def sample_of_term(motion: Motion, matched: Matched, term: AbstractAdaptiveTerm) -> Any:
-    """`AbstractAdaptiveTerm.sample` of matched points."""
     return term.sample(matched.at(motion))

@@ -34,10 +34,8 @@ class TiePoints(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians.
-
-    `fixed`: (6, 6), rows f with f · ξ = 0 and rows of zeros; None if no direction is fixed. A constant to autodiff.
-    """
+    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians. Rows f of `fixed`,
+    (6, 6), fix f · ξ = 0 or are zeros; constant to autodiff; None if no direction is fixed."""
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]
@@ -46,13 +44,8 @@ class Prior(NamedTuple):
 
 
 class PoseForm(NamedTuple):
-    """Costs of tie points and of a prior.
-
-    Attributes:
-        stiffness, force: Q and G, with D flattened row by row and Δt in units of the radius.
-        prior: relative to the source point at c and to c, lengths in units of the radius; without one its information
-            is 0.
-    """
+    """Costs of tie points, Q and G with D flattened row by row and Δt in units of the radius; and of a prior, relative
+    to the source point at c and to c, lengths in units of the radius: without one, its information is 0."""
 
     stiffness: Float[AnyArray, "12 12"]
     force: Float[AnyArray, "12"]
@@ -88,14 +81,9 @@ def form_at(
 
 
 class PoseMeasurements(eqx.Module):
-    """Tie points and a prior as a force on the pose, γ(T).
+    """Tie points and a prior as a force γ(T) on the pose. `form` refers to T₀, `rotation` and `translation`.
 
-    Twists turn about `center`, in the target's frame, with lengths in units of `radius`.
-
-    Attributes:
-        rotation, translation: T₀, the pose to which `form` refers.
-        center, radius: of the points that are matched there, metres.
-        form: of tie points and prior.
+    Twists turn about `center`, in the target's frame, in units of `radius`: of the points matched at T₀, metres.
     """
 
     rotation: Float[AnyArray, "3 3"]
@@ -155,14 +143,14 @@ class Fusion(PoseMeasurements):
     inverse covariance, so s and γ cannot simply be added. Along directions that the matches do not constrain, P is
     zero. Constants to autodiff: all but `form`.
 
-    Where the prior fixes directions, the equation is that of the free ones, and F ξ = 0 (see `fixed_directions`). The
-    basis is then one of ξ, since the free twists at T depend on T and on the prior's pose.
+    Where the prior fixes directions, the equation is that of the free ones, and F ξ = 0 (see the module). The basis is
+    then one of ξ, since the free twists at T depend on T and on the prior's pose.
 
     Attributes:
-        basis: (6, 6) twists as columns; changes of ξ if directions are fixed.
+        basis: twists as columns; changes of ξ if directions are fixed.
         gain, information: P and A B⁻¹ A in this basis.
-        constrained: whether matches, tie points or prior constrain the twist.
-        fixed: whether the prior fixes it; None if it fixes none.
+        constrained: by matches, tie points or prior.
+        fixed: by the prior; None if it fixes none.
     """
 
     basis: Float[AnyArray, "6 6"]
@@ -177,7 +165,6 @@ class Fusion(PoseMeasurements):
         return self.constrained if self.fixed is None else self.constrained & ~self.fixed
 
     def twists_at(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Float[AnyArray, "6 6"]:
-        """The basis as twists at a pose."""
         if self.fixed is None:
             return self.basis
         return jnp.linalg.solve(self.prior_residual(rotation, translation)[1].T, self.basis)

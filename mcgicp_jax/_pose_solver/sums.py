@@ -31,25 +31,20 @@ _SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability"
 class Sums(NamedTuple):
     """Sums over correspondences, see the module. The centre c is the centroid of the moved, matched source points.
 
-    Taken about this centre and at the current pose, the sums remain precise in float32. Symmetric 3×3
-    matrices are stored as upper triangles, h hᵀ is stored whole.
+    Taken about this centre and at the current pose, the sums remain precise in float32. Symmetric 3×3 matrices are
+    stored as upper triangles, h hᵀ is stored whole.
 
     Attributes:
-        center: c, metres.
         count: number of correspondences; every candidate counts.
         square_extent: Σ |p|², metres².
-        energy: e.
-        cost: Σ ρ.
+        energy, cost, force, stiffness: e, Σ ρ, G, Q.
         square_distance: Σ |d|² of the mean over the candidates of a source point, metres².
         num_matched: number of source points with a match.
-        force: G.
-        stiffness: Q.
         mass: Σ w h hᵀ without points near the sensor, as the following; None where observability is not known.
-        observability: Σ w O ⊗ h hᵀ by the shape of the surfaces, less that of points near the sensor; None where it is
-            not known.
+        observability: Σ w O ⊗ h hᵀ by shape, less that of points near the sensor; None where it is not known.
         channel_observability: the same by the channels; None also where they are not used.
-        agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where the
-            slopes are not known, as before the last step.
+        agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where slopes
+            are not known, as before the last step.
         surplus: the same by the surplus of gradients across the lines of sight; 0 where the slopes are not known.
     """
 
@@ -93,16 +88,12 @@ def sums_of(
     near: Float[AnyScalar, ""],
     last: Bool[AnyScalar, ""],
 ) -> Sums:
-    """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points.
+    """The sums at a pose in one pass over the correspondences, the only part of a step that touches points.
 
     All sums but those for the centre are rows of one product with h hᵀ: sums of their own would be programs of several
-    loops each, which evaluate the same expressions again.
-
-    Args:
-        near: metres; source points within this distance of the sensor, the origin of their frame, may be the sensor's
-            own vehicle, which moves with it. By shape they count against a motion, which they would hold wherever
-            others say less; their channels do not count.
-        last: whether the loop ends with these sums, see `observability`.
+    loops each, which evaluate the same expressions again. Source points within `near` metres of the sensor, the origin
+    of their frame, may be the sensor's own vehicle, which moves with it. By shape they count against a motion, which
+    they would hold wherever others say less; their channels do not count.
     """
     posed, found, counts = linearize_at(motion, matched, terms)
     mask = jnp.asarray(matched.valid).astype(posed.moved.dtype)
@@ -154,7 +145,6 @@ def sums_of(
 
 
 def with_one(points: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
-    """h = (p, 1) of each point."""
     return jnp.concatenate([points, jnp.ones_like(points[:1])])
 
 
@@ -184,8 +174,8 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
 def observability(
     posed: PosedMatches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]
 ) -> list[Float[Array, "6 n"]]:
-    """O per correspondence, in the target's frame: mean over its two points, by shape, and where channels are used, by
-    channels; then, if the surfaces have `noise` with slopes, by the agreement of the channels, and its surplus.
+    """O per correspondence, in the target's frame, mean over its two points: by shape; where channels are used, by
+    channels; and if surfaces have `noise` with slopes, by the agreement of the channels, and its surplus.
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
     cell. For cells it is therefore the product of both, whose noise is independent, less what they have in common by
@@ -214,10 +204,8 @@ def observability(
 
 
 def combine(parts: Sums) -> Sums:
-    """Add the sums of blocks, stacked along the first axis, after moving them to the common centroid. NumPy, float64.
-
-    The blocks are added in their order, so that the result does not depend on the number of threads.
-    """
+    """The sums of blocks, stacked along the first axis, about the common centroid. NumPy, float64, added in their
+    order, so that the result does not depend on the number of threads."""
     # Non-finite values propagate into the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         center = parts.count @ parts.center / max(parts.count.sum(), 1)
@@ -227,7 +215,6 @@ def combine(parts: Sums) -> Sums:
 
 
 def _about(center: Float[np.ndarray, "3"], parts: Sums) -> Sums:
-    """The sums of blocks about another centre."""
     offset = parts.center - center
     shift = np.zeros((len(offset), 4, 4)) + np.eye(4)
     shift[:, :3, 3] = offset
