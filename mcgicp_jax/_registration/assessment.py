@@ -56,7 +56,6 @@ class Assessment(NamedTuple):
 
 
 def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Callable[[], Moments]) -> Assessment:
-    """The assessment of a loop that has ended; `moments` computes `moments_of` the loop."""
     state, fusion = loop.state, executor.problem.fusion
 
     def covariance() -> Float[np.ndarray, "6 6"]:
@@ -124,8 +123,6 @@ def _responding(executor: AbstractExecutor, loop: LoopResult) -> tuple[AbstractT
 
 
 def as_float64(tree: Any) -> Any:
-    """The arrays as NumPy arrays, float64 instead of float32."""
-
     def convert(leaf: Any) -> np.ndarray:
         array = np.asarray(leaf)
         return array.astype(np.float64) if array.dtype == np.float32 else array
@@ -169,12 +166,9 @@ def registration_of(
     derivative: Callable[[str, str], np.ndarray] | None = None,
     inputs: Any = None,
 ) -> RegistrationResult:
-    """The `RegistrationResult` of a final state, in the user's frames; NumPy where everything is concrete.
+    """The result of a final state, in the user's frames; NumPy where everything is concrete.
 
-    Args:
-        used: which source points could be matched; False for padding.
-        derivative: computes `RegistrationResult.jacobian`.
-        inputs: of the registration; only the pose has a derivative by those that are traced.
+    `used` marks the source points that could be matched. Only the pose has a derivative by traced `inputs`.
     """
     history: dict[str, Any] = records._asdict()
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
@@ -236,7 +230,6 @@ def _read_only(tree: Any) -> Any:
 
 
 def _constraints_in_user_frame(assessment: Assessment, origin: Any) -> Constraints:
-    """Information matrix and directions, for the user's source."""
     information, directions = assessment.constraints.value
     if is_concrete(origin) and not np.any(origin):
         return Constraints(information, directions)

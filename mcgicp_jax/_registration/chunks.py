@@ -63,13 +63,9 @@ _ROWS_WITH_NEIGHBORS = 2**16
 
 
 class ChunkPair(NamedTuple):
-    """A pair of clouds that waits for a chunk, as NumPy arrays.
+    """A pair that waits for a chunk, NumPy arrays: finite points, padded to a size class, without origin and names.
 
-    Attributes:
-        start: initial pose of the centred clouds.
-        max_coarse_distance: as in `Options`.
-        source, target: finite points, padded to a size class, origin and names left out; neighbours that are None are
-            found on the devices.
+    `start` is between the centred clouds. Neighbours that are None are found on the devices.
     """
 
     start: jaxlie.SE3
@@ -103,10 +99,10 @@ def run_pairs(
     num_neighbors: int,
     covariances: bool,
 ) -> Iterator[Ended[Key] | Refused[Key]]:
-    """Register many pairs, spread over the `default_devices`, and yield their results, if so wanted with `covariances`.
+    """Register many pairs, spread over the `default_devices`, and yield their results.
 
-    `num_neighbors` is that of clouds that have no neighbours yet. Pairs of similar sizes share a program: to compile
-    one takes as long as to register thousands of pairs.
+    `num_neighbors` is for clouds without neighbours. Pairs of similar sizes share a program: to compile one takes as
+    long as to register thousands of pairs.
     """
     # Numbers are traced, so that others compile nothing.
     numbers = options.numbers
@@ -146,8 +142,7 @@ def run_pairs(
 
 
 class _Group(Generic[Key]):
-    """Pairs of the same shapes, and their chunks. Where memory does not suffice, chunks have half the size, and the
-    pairs on the devices begin again."""
+    """Pairs of the same shapes, in chunks. Where memory does not suffice, chunks are halved and begin again."""
 
     def __init__(self, program: Callable[..., Any], mesh: Mesh, max_iterations: int):
         self._program, self._num_devices = program, mesh.size
@@ -174,7 +169,6 @@ class _Group(Generic[Key]):
         return len(self.waiting) >= (self._per_device or self._largest()) * self._num_devices
 
     def finish(self) -> Iterator[Ended[Key] | Refused[Key]]:
-        """Run until no pair is left."""
         while self.waiting or self._slow or self._dispatched:
             yield from self.run()
 
@@ -251,8 +245,7 @@ def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
 
 
 def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
-    """The pair, padded to the smallest of the `sizes` of earlier ones that has few rows, or whose rows it fills by half
-    or more. Without one it stays as it is, and its own size joins them."""
+    """The pair, padded to the smallest of the `sizes` of earlier ones that suits; without one, its own joins them."""
     own = pair.source.valid.size, pair.target.valid.size
     if own in sizes:
         return pair
@@ -288,9 +281,8 @@ def _registered(
     covariances: bool,
     mesh: Mesh,
 ) -> Packed[tuple[State, Assessment, Record, Any]]:
-    """States, assessments at their poses, histories, and settings and fits for `doubt_of_start`, of stacked pairs, in
-    one array; a status is negative where a loop has not ended after `max_updates`. `numbers` are the options that are
-    numbers, by name."""
+    """States, assessments, histories, and settings and fits for `doubt_of_start`, of stacked pairs, packed; a status is
+    negative where a loop has not ended after `max_updates`. `numbers` are the options that are numbers."""
 
     def registered(pair: ChunkPair, common: Any) -> Any:
         method, robust, numbers, max_updates = common

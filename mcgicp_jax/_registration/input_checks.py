@@ -87,8 +87,7 @@ def check_matches(
     method: AbstractMethod,
     temperature: ArrayLike | None,
 ) -> None:
-    """Raise `ValueError` unless both are clouds, and there is one match per source row, or several with a positive
-    `temperature` or for a method that uses several."""
+    """Raise unless there is one match per source row, or several for a method that uses several or a `temperature`."""
     if not isinstance(matches, Correspondences):
         kind = type(matches).__name__
         raise ValueError(f"matches: expected the result of find_correspondences, got {kind}; is the order right?")
@@ -129,8 +128,7 @@ def _is_extension(part: object) -> bool:
 
 
 def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: PointCloud) -> None:
-    """Warn if α or channels are differentiated outside of `jit`: α decides matches alone, and channels act mostly by
-    them, unless the photometric term compares them. Hard matches are constant to autodiff."""
+    """Warn if α or channels are differentiated outside of `jit`, with hard matches, which are constant to autodiff."""
     weights = getattr(method, "channel_weights", None)
     if not is_concrete(weights) and is_concrete(primal(weights)):
         warn(
@@ -149,11 +147,9 @@ def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: Poi
 def warn_of_estimated_parameters(
     method: AbstractMethod, source: PointCloud, target: PointCloud, soft: bool, equalize_channels: bool = False
 ) -> None:
-    """Warn if channels are differentiated outside `jit` while Λ, α of soft matches, or gains are estimated from them.
-
-    The photometric term uses neither, but estimates numbers from the residuals of points and channels. All of these are
-    constant to autodiff. Of hard matches, α decides the matches alone, which are, too.
-    """
+    """Warn if inputs are differentiated outside `jit` from which parameters, constant to autodiff, are estimated: from
+    channels Λ, gains, and α of soft matches (α of hard ones decides the matches alone); from points and channels the
+    numbers of the photometric term."""
     channels = source.channels, target.channels
     if not isinstance(method, MultiChannelGICP):
         return
@@ -216,8 +212,7 @@ def _differ(lengths: list[float]) -> bool:
 
 
 def warn_of_inputs(source: PointCloud, target: PointCloud, method: AbstractMethod, equalize_channels: bool) -> None:
-    """Warn of channels in different units; and with GICP, if one cloud has covariances in another unit than GICP's,
-    which are computed for the other cloud."""
+    """Warn of channels in different units, and with GICP of covariances of one cloud that are not in its unit."""
     for name, cloud, other in (("source", source, target), ("target", target, source)):
         if isinstance(method, GICP) and cloud.covariances is not None and other.covariances is None:
             rows, counts = sampled_rows(cloud.valid)

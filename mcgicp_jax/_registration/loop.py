@@ -69,11 +69,8 @@ class Problem(eqx.Module):
     """Inputs of the registration loop.
 
     Attributes:
-        start: the initial pose.
-        source, target: the surfaces of both clouds.
         terms: the residuals of each correspondence, before any number is adapted.
-        measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`; None
-            if there are none.
+        measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`.
         fixed: the prior if it fixes directions, else None.
         matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
         num_candidates: number of target points that a source point is matched with.
@@ -144,13 +141,11 @@ class State(NamedTuple):
     Attributes:
         pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
         status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
-        num_iterations: number of updates so far.
-        since: (6,) sum of the updates since the last iteration whose number is a power of two, metres and radians.
+        since: sum of the updates since the last iteration whose number is a power of two, metres and radians.
         extent: largest cost, over these updates, of moving the matched points by `since`.
         sums: at the pose before the update; this and the following are None before the first step on the host.
-        information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
-        directions: at the pose before the update, about the centroid; None for `estimate_pose`.
-        record: of this step.
+        information: there, about the centroid, lengths in units of the radius.
+        directions: there, about the centroid; None for `estimate_pose`.
     """
 
     pose: jaxlie.SE3
@@ -165,13 +160,9 @@ class State(NamedTuple):
 
 
 class LoopResult(NamedTuple):
-    """The loop after some steps.
+    """The loop after some steps, with matches and terms at the pose before the last update, and records of the steps.
 
-    Attributes:
-        state: after the last step.
-        matches: at the pose before the last update; None before the first.
-        terms: as they were at that pose.
-        history: records of the steps; arrays with one entry for each possible step inside transformations.
+    Matches are None before the first step. Inside transformations, the history has one entry for each possible step.
     """
 
     state: State
@@ -181,11 +172,8 @@ class LoopResult(NamedTuple):
 
 
 class AbstractExecutor(abc.ABC):
-    """How the parts of the loop are done for one problem.
-
-    Functions that an executor applies to correspondences are defined at module level, take a `Motion`, `Matched` and
-    further arguments, and return a pytree of arrays.
-    """
+    """How the parts of the loop are done for one problem. Functions that it applies to correspondences are defined at
+    module level; they map a `Motion`, `Matched` and further arguments to a pytree of arrays."""
 
     def __init__(self, problem: Problem):
         self.problem = problem
@@ -212,8 +200,7 @@ class AbstractExecutor(abc.ABC):
     def nearest(
         self, pose: Float[AnyArray, "7"], source: SearchPoints, alone: bool = True, num_candidates: int = 1
     ) -> Int[AnyArray, "m n"]:
-        """Target rows nearest in position (`alone`), or in position and channels, at a pose `jaxlie.SE3.wxyz_xyz`; −1
-        for none within the fine `max_distance`."""
+        """Target rows nearest in position, if not `alone` also in channels; −1: none within the fine `max_distance`."""
 
     @abc.abstractmethod
     def rows(
@@ -223,11 +210,9 @@ class AbstractExecutor(abc.ABC):
 
     @abc.abstractmethod
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
-        """`sums_of` all correspondences, as the executor keeps them while the loop runs.
-
-        In the `last` step, the channels of matched points must agree, and so must the shapes of cells. Far from the
-        right pose they do not, and before that step what each cloud observes guides the pose.
-        """
+        """`sums_of` all correspondences, as the executor keeps them while the loop runs. In the `last` step alone, the
+        channels of matched points must agree, and so must the shapes of cells: far from the right pose they do not, and
+        what each cloud observes guides the pose."""
 
     def update(self, state: State, sums: Any) -> State:
         """The state after an update of the pose, without the sums."""
@@ -239,8 +224,7 @@ class AbstractExecutor(abc.ABC):
         """`scores_of` all correspondences; further arguments are those of that function."""
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        """The terms with their numbers estimated anew at the pose of a state, from a sample of the matches. Outside the
-        fine phase, executors keep those `before`."""
+        """The terms, their numbers estimated from a sample of the matches; outside the fine phase, those `before`."""
         terms = self.problem.terms
         if not is_adaptive(terms):
             return terms
@@ -291,7 +275,6 @@ class AbstractExecutor(abc.ABC):
         return self.within(Motion.of(pose), matches)
 
     def within(self, motion: Motion, matches: Matches) -> Matches:
-        """The matches whose distance is at most `max_distance`."""
         near = self.distances(motion, matches) <= matches.max_distance
         return matches._replace(indices=numpy_for(near).where(near, matches.indices, -1))
 
@@ -336,7 +319,7 @@ def update(
 
     Matches, and the pose with them, may alternate for ever. The pose then returns to that of the last iteration whose
     number is a power of two (Brent 1980). Such a cycle ends the loop if its poses differ by less than one standard
-    deviation, estimated as if the residuals were independent; the deviation of the pose is larger.
+    deviation, estimated as if residuals were independent, which is smaller than that of the pose.
     """
     change, directions, degenerate = _change(pose, sums, settings, measurements, fixed)
     moved = move_pose(pose, change.twist, sums.center)

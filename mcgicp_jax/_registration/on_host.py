@@ -27,10 +27,7 @@ from mcgicp_jax._terms.base import AbstractTerm
 
 
 class HostExecutor(AbstractExecutor):
-    """Blocks of rows on the host for one pair of concrete clouds.
-
-    `index_of` returns the index of the target; called with True, that for a search in position alone.
-    """
+    """Blocks of rows on the host, for concrete clouds. `index_of(True)` is for a search in position alone."""
 
     def __init__(self, problem: Problem, index_of: Callable[[bool], AbstractIndex], num_threads: int | None):
         super().__init__(problem)
@@ -137,7 +134,6 @@ class HostExecutor(AbstractExecutor):
 
 
 def _combined(parts: list[Packed[Sums]]) -> Packed[Sums]:
-    """The sums of all blocks."""
     tables, dtype = np.stack([part.table for part in parts]), parts[0].table.dtype
     with np.errstate(over="ignore"):
         sums = combine(Packed(tables.astype(np.float64), parts[0].layout).tree)
@@ -153,5 +149,4 @@ def _update(
     measurements: PoseMeasurements | None,
     fixed: Prior | None,
 ) -> Packed[State]:
-    """`update` with packed arguments and result."""
     return Packed.of(update(*state, sums.tree, settings.tree, measurements, fixed), num_axes=0)

@@ -35,9 +35,8 @@ _ENOUGH_SOURCE_POINTS = 10_000
 class Options:
     """Options of `register`, documented there; batches, odometry and the command line take the same ones.
 
-    Attributes:
-        min_coarse_distance, max_coarse_distance: least and largest coarse `max_distance` at all scales, metres, but
-            not below the fine one: how far off the initial pose may be.
+    `min_coarse_distance` and `max_coarse_distance` bound the coarse `max_distance` at all scales, metres, but not below
+    the fine one: how far off the initial pose may be.
     """
 
     max_distance: Distance | None = None
@@ -99,8 +98,7 @@ class Options:
 
 
 class GivenOptions(TypedDict, total=False):
-    """`Options` as keyword arguments of batches, odometry and multiway registration, for editors and type checkers,
-    which cannot derive it."""
+    """`Options` as keyword arguments of other functions, for editors and type checkers, which cannot derive it."""
 
     max_distance: Distance | None
     max_iterations: int

@@ -53,9 +53,9 @@ class Inputs(NamedTuple):
     Attributes:
         source, target: preprocessed clouds; raw ones where the method makes cells of them.
         method: its parameters may be unset.
-        robust, tie_points, prior: as in `register`, the latter two relative to the origins of the clouds.
-        temperature: of a soft assignment, metres; None without one.
-        source_rows: (n,) rows of the source that are matched; None for all.
+        tie_points, prior: relative to the origins of the clouds.
+        temperature: of a soft assignment, metres.
+        source_rows: rows of the source that are matched; None for all.
         gains: (C,) by which the channels of the source were multiplied, constant to autodiff; None unless equalised.
     """
 
@@ -70,19 +70,15 @@ class Inputs(NamedTuple):
     gains: Any = None
 
     def values(self) -> Inputs:
-        """The arguments without the traces of differentiation, see `primal`. Concrete clouds remain the same objects,
-        with which derived quantities are cached."""
+        """Without traces, see `primal`. Concrete clouds stay the same objects, with which derived values are cached."""
         return self if is_concrete(self) else Inputs(*map(primal, self))
 
 
 class PoseDerivative(AbstractLinearMap):
     """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of a final pose by some inputs; 0 if there is none.
 
-    Args:
-        inputs: of the registration, which differentiation may trace.
-        fixed: the same, concrete.
-        executor, loop: of the registration that ended.
-        arrays: those of `inputs` that the derivative is with respect to; by default all that are traced.
+    Differentiation may trace `inputs`, not `fixed`, which are the same. The derivative is by those of `inputs` in
+    `arrays`, by default all that are traced.
     """
 
     def __init__(
@@ -205,8 +201,7 @@ def _score_of_rows(numbers: tuple[Motion, ImplicitRoot, Any, Any], *rows: Rows) 
 def _balance_and_slope(
     pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, matches: Float[Array, "6 7"]
 ) -> Float[Array, "6 7"]:
-    """The equation with tie points and a prior, and its derivative by a twist. `matches` has the same of the
-    matches alone: g in its first column."""
+    """The equation with tie points and a prior, and its derivative by a twist, from those of the matches, g first."""
 
     def balance(twist: Float[Array, "6"]) -> Float[Array, "6"]:
         return balance_along(twist, pose, root, matches[:, 0] + matches[:, 1:] @ twist, fusion)
@@ -223,8 +218,6 @@ def _vjp_of_balance(
     score: Float[Array, "6"],
     cotangents: Float[Array, "m 6"],
 ) -> tuple[Float[Array, "m 6"], PoseForm]:
-    """Cotangents of the score and of the form of tie points and prior, from those of the equation."""
-
     def balance(score: Float[Array, "6"], form: PoseForm) -> Float[Array, "6"]:
         nowhere = jnp.zeros_like(score)
         return balance_along(nowhere, pose, root, score, eqx.tree_at(lambda fusion: fusion.form, fusion, form))
@@ -251,8 +244,7 @@ def jacobian(
 
 
 def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult) -> PoseDerivative | None:
-    """The derivative of the final pose by the traced arrays among the arguments on which it depends; None if there are
-    none. Origins are added later, see `pose_in_user_frame`."""
+    """The derivative of the final pose by the traced arrays on which it depends; origins: see `pose_in_user_frame`."""
     if is_concrete(given):
         return None
     source = given.source

@@ -88,13 +88,8 @@ _COARSE_VOXEL = 0.25
 class Run(NamedTuple):
     """A registration that has ended.
 
-    Attributes:
-        inputs: of the problem, constant to autodiff outside `jit`.
-        loop: its end, constant to autodiff.
-        executor: of the loop; None inside `jit`.
-        state: computes the final state, whose pose is differentiable inside `jit`.
-        assessment, moments: compute these of the final pose.
-        doubt: why the pose is UNVERIFIED, outside `jit`; or nothing.
+    `loop` is constant to autodiff, and so are `inputs` outside `jit`. Inside `jit`, `executor` is None, and the pose of
+    `state()` is differentiable. `doubt` says why a pose is UNVERIFIED, outside `jit`.
     """
 
     inputs: Inputs
@@ -125,8 +120,7 @@ def register_pair(
 
 
 def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> RegistrationResult:
-    """The result of `run(given, *arguments, traced=False)`, such as `run_pair`; differentiable by the inputs. The
-    arguments are constants to autodiff.
+    """The result of `run(given, *arguments, traced=False)`, such as `run_pair`; differentiable by `given` alone.
 
     This is where it is decided whether a registration runs on the host or is traced.
     """
@@ -156,8 +150,7 @@ def prepared(
     prior: GivenPrior | None = None,
     channels_checked: bool = True,
 ) -> Inputs:
-    """The arguments of a registration, checked, with clouds that are `preprocessed`, and if `channels_checked`,
-    `without_sensor_patterns`."""
+    """The arguments, checked; clouds are `preprocessed`, and if `channels_checked`, `without_sensor_patterns`."""
     check_method(method)
     sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
     source, target = preprocessed(sides, method, options)
@@ -251,8 +244,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
 
 @with_settings_of_package
 def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[RegistrationResult]:
-    """The results of registrations, given the arguments of each, or None. Outside `jit`, the poses get derivatives by
-    those arrays of these arguments that are traced, all of which are computed side by side."""
+    """The results; outside `jit`, poses get derivatives by the traced arrays of `givens`, computed side by side."""
     derivatives = [
         None if given is None or run.executor is None else differentiated(given, run.inputs, run.executor, run.loop)
         for run, given in zip(runs, givens, strict=True)
@@ -303,8 +295,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
 def problem_of(
     given: Inputs, init: Pose | None, options: Options, num_threads: int | None, matches: Matches | None = None
 ) -> tuple[Problem, Inputs]:
-    """The problem for preprocessed clouds, NumPy arrays where everything is concrete; and its inputs, with the
-    parameters of the method chosen. `matches` are those at every pose; None to search for them."""
+    """The problem, in NumPy where everything is concrete; and its inputs, with the method's parameters chosen."""
     source, target, method = given[:3]
     check_clouds(source, target, method)
     rows = rows_to_match(source, options)
@@ -364,9 +355,8 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
 
 
 def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable[[float], Run]) -> tuple[Run, str]:
-    """A registration, or one from the same initial pose with a smaller `max_distance`, `closely(max_distance)`, if it
-    may have left a right initial pose and surfaces coincide better there (see `doubt_of_start`); and why its pose is
-    ambiguous, or nothing."""
+    """The registration, or `closely(max_distance)` from the same start if it may have left a right initial pose and
+    surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing."""
     settings, state, executor = run.problem.settings, run.loop.state, cast(HostExecutor, run.executor)
     source, target = run.inputs[:2]
     start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
@@ -423,8 +413,7 @@ def preprocessed(
     num_neighbors: int = NUM_NEIGHBORS,
     checked: bool = True,
 ) -> list[PointCloud]:
-    """The clouds "source" and "target", preprocessed with one voxel size. Where the method makes cells of raw points,
-    clouds stay raw."""
+    """The sides "source" and "target", preprocessed with one voxel size; raw where the method makes cells of them."""
     points = {name: cloud for name, cloud in sides.items() if not options.takes_raw(method, name)}
     voxels, grids = voxels_and_grids(voxel_size, *points.values())
     for (name, cloud), grid in zip(points.items(), grids, strict=True):
@@ -437,8 +426,8 @@ def preprocessed(
 def _at_scales(given: Inputs, voxel_sizes: Sequence[float]) -> Iterator[Inputs]:
     """The inputs of the registrations for these voxel sizes, metres; the last one gives the result.
 
-    Methods that need cells use cells of the last size; for the other sizes, GICP registers smaller voxels. Other
-    methods register the voxels of each size, and then the clouds.
+    Cells have the last size, and GICP registers smaller voxels at the others. Methods without cells register the voxels
+    of each size, and then the clouds.
     """
 
     def with_clouds(each: Callable[[str, PointCloud], PointCloud], method: AbstractMethod) -> Inputs:

@@ -307,16 +307,12 @@ USABLE = (Status.CONVERGED, Status.DEGENERATE, Status.MAX_ITERATIONS)
 
 
 def is_usable(result: RegistrationResult) -> bool:
-    """Whether the pose may start another registration: it is finite and based on enough matches.
-
-    This includes MAX_ITERATIONS and DEGENERATE, where unconstrained directions may still have their initial values, but
-    not UNVERIFIED: other registrations would inherit a wrong pose, and end as CONVERGED.
-    """
+    """Whether the pose may start another registration: it is finite and based on enough matches. An UNVERIFIED one may
+    not: other registrations would inherit a wrong pose, and end as CONVERGED."""
     return result.status in USABLE
 
 
 def unknown_uncertainty() -> Lazy[Uncertainty]:
-    """NaN."""
     return Lazy.of(Uncertainty(np.full((6, 6), np.nan), np.full(6, np.nan)))
 
 
@@ -327,10 +323,8 @@ def computed(result: RegistrationResult) -> RegistrationResult:
 
 
 def verified(result: RegistrationResult, trusted: bool = True) -> RegistrationResult:
-    """The result, UNVERIFIED instead of usable if few points match or the start is in doubt.
-
-    Not part of `register_pair`, whose results odometry, loops and global poses compare at any overlap.
-    """
+    """The result, UNVERIFIED instead of usable if few points match or the start is in doubt. Not part of
+    `register_pair`, whose results odometry, loops and global poses compare at any overlap."""
     code: Any = result.status_code
     overlap: Any = result.overlap
     if isinstance(overlap, np.floating) and trusted and overlap >= LEAST_OVERLAP:

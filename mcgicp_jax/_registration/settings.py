@@ -41,13 +41,11 @@ class Settings(NamedTuple):
     """Numerical settings of the loop, as arrays, so that changing one does not recompile.
 
     Attributes:
-        max_distance: maximum correspondence distance in the coarse phase, metres.
-        fine_distance: the same in the fine phase, metres; at most `max_distance`.
+        max_distance, fine_distance: maximum correspondence distances, metres; the fine one is not larger.
         coarse_stride: the coarse phase uses every `coarse_stride`-th source point.
         translation_tolerance, rotation_tolerance: an update below both is the last; metres and radians.
         coarse_translation_tolerance, coarse_rotation_tolerance: an update below both ends the coarse phase.
         max_iterations: maximum number of updates, both phases together.
-        hold_unconstrained: whether the pose is kept fixed along unconstrained directions.
         channels_may_move: whether the channels may move with the sensor, so that a pose that they hold is UNVERIFIED.
         rounding: variances of the coordinates of source and target, metres², that are rounded to coarse steps.
         near: source points within this distance of the sensor, metres, constrain no direction of motion.
@@ -67,7 +65,6 @@ class Settings(NamedTuple):
     near: Float[AnyArray, "*batch"]
 
     def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
-        """Maximum correspondence distance at this status, metres."""
         return _either(status == COARSE, self.max_distance, self.fine_distance)
 
     def kernel_width(self, status: Int[AnyScalar, ""]) -> AnyScalar:
@@ -119,7 +116,6 @@ def settings_for(
     channels_may_move: Any,
     dtype: Any,
 ) -> Settings:
-    """The settings of a registration; `stride` is that of the coarse phase."""
     max_distance: Any = options.max_distance
     tolerance: Any = options.translation_tolerance
     # Settings are constants to autodiff, even if they are derived from a differentiated cloud.

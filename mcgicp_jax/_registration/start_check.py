@@ -61,10 +61,10 @@ def doubt_of_start(
     measure_fit: Callable[[], tuple[AnyScalar, AnyScalar]],
     at_scales: bool = False,
 ) -> tuple[AnyScalar, AnyScalar, bool, bool] | None:
-    """If a registration may have left a right initial pose: its `surface_fit`, which `measure_fit` computes, whether
-    the clouds have little in common, and whether there are few matches; else None.
+    """If a registration may have left a right initial pose: its `surface_fit`, computed by `measure_fit`, whether the
+    clouds have little in common, and whether there are few matches; else None.
 
-    It may have left it if it has moved the points by more than the fine `max_distance`, and surfaces do not coincide at
+    It may have done so if it has moved the points by more than the fine `max_distance`, and surfaces do not coincide at
     its pose, or have little in common. (At several scales the initial pose is known to be far off, where the fine
     distance leads nowhere.)
     """
@@ -79,8 +79,8 @@ def doubt_of_start(
 
 
 def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> tuple[AnyScalar, AnyScalar]:
-    """(a/m)² at the end of a registration, for the agreement a and the misfit m, at least 1, of the surfaces of matched
-    points: see `agreement_of`. 0 without matches. And the fraction of the source points that have a match."""
+    """(a/m)² at the end of a registration, for the agreement a and the misfit m ≥ 1 of matched surfaces, see
+    `agreement_of`; 0 without matches. And the fraction of the source points that have a match."""
     points, others = executor.problem.source.points, executor.problem.target.points
     rows, counts = sampled_rows(executor.problem.source.search.valid, _SAMPLE)
     # In position alone: matches in position and channels lie further apart, also at right poses.

@@ -51,7 +51,6 @@ else:
 def checked_measurements(
     tie_points: GivenTiePoints | None, prior: GivenPrior | None, source: PointCloud, target: PointCloud
 ) -> tuple[TiePoints | None, Prior | None]:
-    """Tie points and prior, checked, relative to the origins of the clouds."""
     ties = None if tie_points is None else _centred_tie_points(tie_points, source, target)
     return ties, None if prior is None else _centred_prior(prior, source, target)
 
@@ -141,9 +140,8 @@ def _information(
 def measured(
     problem: Problem, ties: TiePoints | None, prior: Prior | None, traced: bool, *, limits: bool = False
 ) -> Problem:
-    """The problem of a first registration with tie points and a prior, which act from the start on. If the prior
-    `limits` it, the coarse `max_distance` is at most what the prior leaves between the initial pose and the right one.
-    """
+    """The problem of a first registration with tie points and a prior. If the prior `limits` it, the coarse
+    `max_distance` is at most what the prior leaves between the initial pose and the right one."""
     dtype, (start, ties, prior) = problem.start.wxyz_xyz.dtype, constant((problem.start, ties, prior))
     rows = problem.source.search
     xp: Any = jnp if traced else np

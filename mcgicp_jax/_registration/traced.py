@@ -29,15 +29,14 @@ from mcgicp_jax._terms.base import AbstractTerm, is_adaptive, with_numbers_of
 
 
 class TracedExecutor(AbstractExecutor):
-    """Whole arrays inside transformations. `search` finds the matches; None if they are fixed. The history has room for
-    `max_iterations` updates."""
+    """Whole arrays inside transformations. `search` is None if matches are fixed; histories have `max_iterations` + 1
+    entries."""
 
     def __init__(self, problem: Problem, search: Any, max_iterations: int):
         super().__init__(problem)
         self._search, self._max_iterations = search, max_iterations
 
     def begin(self) -> LoopResult:
-        """The loop before its first step."""
         problem, first = self.problem, jnp.asarray(self.problem.first_status)
         nowhere = jnp.full((problem.num_candidates, problem.source.num_points), -1, jnp.int32)
         matches = problem.matches or Matches(nowhere, jnp.zeros_like(problem.settings.fine_distance))
@@ -118,19 +117,16 @@ class TracedExecutor(AbstractExecutor):
 
 @partial(jax.jit, static_argnames="max_iterations")
 def run_traced(problem: Problem, search: AbstractSearch | None, max_iterations: int) -> LoopResult:
-    """The loop, compiled."""
     return TracedExecutor(problem, search, max_iterations).run()
 
 
 @jax.jit
 def assess(loop: LoopResult, problem: Problem, search: AbstractSearch | None) -> Assessment:
-    """The assessment of the loop."""
     return assessment_of(TracedExecutor(problem, search, 0), loop, partial(moments_traced, loop, problem, search))
 
 
 @jax.jit
 def moments_traced(loop: LoopResult, problem: Problem, search: AbstractSearch | None) -> Moments:
-    """`moments_of` the loop."""
     return moments_of(TracedExecutor(problem, search, 0), loop)
 
 
