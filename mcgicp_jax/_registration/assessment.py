@@ -71,7 +71,6 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Callabl
 
 
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
-    """Sums over the scores of all correspondences at the final pose."""
     problem, state = executor.problem, loop.state
     motion, valid = Motion.of(state.pose.wxyz_xyz), executor.source_of(loop.matches).valid
     one = np.ones((), problem.source.points.dtype)
@@ -166,10 +165,8 @@ def registration_of(
     derivative: Callable[[str, str], np.ndarray] | None = None,
     inputs: Any = None,
 ) -> RegistrationResult:
-    """The result of a final state, in the user's frames; NumPy where everything is concrete.
-
-    `used` marks the source points that could be matched. Only the pose has a derivative by traced `inputs`.
-    """
+    """The result of a final state, in the user's frames; NumPy where everything is concrete. `used` marks the source
+    points that could be matched. Only the pose has a derivative by traced `inputs`."""
     history: dict[str, Any] = records._asdict()
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
     pose, source_origin, target_origin = state.pose, source.origin, target.origin

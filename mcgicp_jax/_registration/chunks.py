@@ -64,9 +64,7 @@ _ROWS_WITH_NEIGHBORS = 2**16
 
 class ChunkPair(NamedTuple):
     """A pair that waits for a chunk, NumPy arrays: finite points, padded to a size class, without origin and names.
-
-    `start` is between the centred clouds. Neighbours that are None are found on the devices.
-    """
+    `start` is between the centred clouds. Neighbours that are None are found on the devices."""
 
     start: jaxlie.SE3
     max_coarse_distance: Any

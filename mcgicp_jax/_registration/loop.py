@@ -73,7 +73,6 @@ class Problem(eqx.Module):
         measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`.
         fixed: the prior if it fixes directions, else None.
         matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
-        num_candidates: number of target points that a source point is matched with.
         temperature: of the soft matches by which the final pose is differentiated, metres; None for those of the loop.
         widens_kernels: whether kernels are wide in the coarse phase: those of the user, not those of a method.
     """
@@ -93,7 +92,6 @@ class Problem(eqx.Module):
     __getattribute__ = object.__getattribute__
 
     def whole(self) -> Problem:
-        """With all rows of both surfaces."""
         return replace(self, source=whole_surface(self.source), target=whole_surface(self.target))
 
     @property
@@ -160,10 +158,8 @@ class State(NamedTuple):
 
 
 class LoopResult(NamedTuple):
-    """The loop after some steps, with matches and terms at the pose before the last update, and records of the steps.
-
-    Matches are None before the first step. Inside transformations, the history has one entry for each possible step.
-    """
+    """The loop after some steps, with matches (None before the first step) and terms at the pose before the last
+    update, and records of the steps: inside transformations, one entry for each possible step."""
 
     state: State
     matches: Any

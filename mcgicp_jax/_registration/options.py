@@ -34,10 +34,8 @@ _ENOUGH_SOURCE_POINTS = 10_000
 @dataclass(frozen=True)
 class Options:
     """Options of `register`, documented there; batches, odometry and the command line take the same ones.
-
     `min_coarse_distance` and `max_coarse_distance` bound the coarse `max_distance` at all scales, metres, but not below
-    the fine one: how far off the initial pose may be.
-    """
+    the fine one: how far off the initial pose may be."""
 
     max_distance: Distance | None = None
     max_iterations: int = 64

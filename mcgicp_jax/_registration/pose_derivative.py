@@ -75,11 +75,8 @@ class Inputs(NamedTuple):
 
 
 class PoseDerivative(AbstractLinearMap):
-    """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of a final pose by some inputs; 0 if there is none.
-
-    Differentiation may trace `inputs`, not `fixed`, which are the same. The derivative is by those of `inputs` in
-    `arrays`, by default all that are traced.
-    """
+    """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of a final pose, 0 if there is none, by `arrays` among the
+    `inputs`; by default, by all that are traced. `fixed` are the same inputs, concrete."""
 
     def __init__(
         self, inputs: Inputs, fixed: Inputs, executor: HostExecutor, loop: LoopResult, arrays: Sequence[Any] = ()

@@ -120,10 +120,8 @@ def register_pair(
 
 
 def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> RegistrationResult:
-    """The result of `run(given, *arguments, traced=False)`, such as `run_pair`; differentiable by `given` alone.
-
-    This is where it is decided whether a registration runs on the host or is traced.
-    """
+    """The result of `run(given, *arguments, traced=False)`, such as `run_pair`; differentiable by `given` alone. Here
+    it is decided whether a registration runs on the host or is traced."""
     values = given.values()
     numbers = [argument.numbers if isinstance(argument, Options) else argument for argument in arguments]
     if not is_concrete(values, numbers):
@@ -424,11 +422,9 @@ def preprocessed(
 
 
 def _at_scales(given: Inputs, voxel_sizes: Sequence[float]) -> Iterator[Inputs]:
-    """The inputs of the registrations for these voxel sizes, metres; the last one gives the result.
-
-    Cells have the last size, and GICP registers smaller voxels at the others. Methods without cells register the voxels
-    of each size, and then the clouds.
-    """
+    """The inputs of the registrations for these voxel sizes, metres; the last one gives the result. Cells have the last
+    size, and GICP registers smaller voxels at the others. Methods without cells register the voxels of each size, and
+    then the clouds."""
 
     def with_clouds(each: Callable[[str, PointCloud], PointCloud], method: AbstractMethod) -> Inputs:
         return given._replace(source=each("source", given.source), target=each("target", given.target), method=method)

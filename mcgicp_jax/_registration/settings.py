@@ -42,7 +42,6 @@ class Settings(NamedTuple):
 
     Attributes:
         max_distance, fine_distance: maximum correspondence distances, metres; the fine one is not larger.
-        coarse_stride: the coarse phase uses every `coarse_stride`-th source point.
         translation_tolerance, rotation_tolerance: an update below both is the last; metres and radians.
         coarse_translation_tolerance, coarse_rotation_tolerance: an update below both ends the coarse phase.
         max_iterations: maximum number of updates, both phases together.

@@ -29,8 +29,7 @@ from mcgicp_jax._terms.base import AbstractTerm, is_adaptive, with_numbers_of
 
 
 class TracedExecutor(AbstractExecutor):
-    """Whole arrays inside transformations. `search` is None if matches are fixed; histories have `max_iterations` + 1
-    entries."""
+    """Whole arrays inside transformations. Without `search`, matches are fixed."""
 
     def __init__(self, problem: Problem, search: Any, max_iterations: int):
         super().__init__(problem)
