@@ -83,10 +83,8 @@ class Matches(NamedTuple):
 
 
 class Matched(eqx.Module):
-    """Both sides of n = m N correspondences, m candidates of N points: the first ones of all points come first.
-
-    Soft assignment alone has `descriptor_distances`, squared, of α · channel, metres², and a `temperature`, metres.
-    """
+    """Both sides of n = m N correspondences, m candidates of N points: the first ones of all points come first. Soft
+    assignment alone has `descriptor_distances`, squared, of α · channel, metres², and a `temperature`, metres."""
 
     source: Surface
     target: Surface

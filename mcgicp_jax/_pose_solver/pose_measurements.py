@@ -81,10 +81,9 @@ def form_at(
 
 
 class PoseMeasurements(eqx.Module):
-    """Tie points and a prior as a force γ(T) on the pose. `form` refers to T₀, `rotation` and `translation`.
-
-    Twists turn about `center`, in the target's frame, in units of `radius`: of the points matched at T₀, metres.
-    """
+    """Tie points and a prior as a force γ(T) on the pose; `form` refers to T₀, `rotation` and `translation`. Twists
+    turn about `center`, in the target's frame, with lengths in units of `radius`; both are of the points matched at T₀,
+    metres."""
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]

@@ -39,7 +39,6 @@ class Sums(NamedTuple):
         square_extent: Σ |p|², metres².
         energy, cost, force, stiffness: e, Σ ρ, G, Q.
         square_distance: Σ |d|² of the mean over the candidates of a source point, metres².
-        num_matched: number of source points with a match.
         mass: Σ w h hᵀ without points near the sensor, as the following; None where observability is not known.
         observability: Σ w O ⊗ h hᵀ by shape, less that of points near the sensor; None where it is not known.
         channel_observability: the same by the channels; None also where they are not used.

@@ -53,10 +53,10 @@ def solve_update(
 ) -> Update:
     """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ over the pose change D = [ΔR − I | Δt], see `sums`.
 
-    M and w are fixed. Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D,
-    1), so its time does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts
-    translation and rotation on the same scale for clouds of any size. Columns of `basis` are twists along which the
-    pose may move; zero columns keep it fixed. `others` are force and stiffness of other measurements.
+    M and w are fixed. Levenberg-Marquardt runs on 13 residuals, a square root of the quadratic form in (vec D, 1), so
+    its time does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts translation and
+    rotation on the same scale for clouds of any size. Columns of `basis` are twists along which the pose may move; zero
+    columns keep it fixed. `others` are force and stiffness of other measurements.
     """
     radius, dtype = sums.radius, sums.center.dtype
     form = _quadratic_form(sums, radius)
