@@ -68,10 +68,8 @@ _clouds = Cache(MAX_ROWS, lambda cached: cached.num_rows)
 
 
 def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Parameters, Value]:
-    """Decorator: cache results with their cloud, the first argument; others are pytrees, compared by value.
-
-    The cloud counts by identity, and values live no longer than it does, unless they refer to it themselves.
-    """
+    """Decorator: cache results with the first argument, a cloud, compared by identity; others are pytrees, compared by
+    value. Values live no longer than their cloud, unless they refer to it themselves."""
 
     @wraps(compute)
     def cached(*arguments: Parameters.args, **named: Parameters.kwargs) -> Value:

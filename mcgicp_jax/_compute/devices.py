@@ -20,7 +20,6 @@ def default_devices() -> list[jax.Device]:
 
 
 def on_accelerator() -> bool:
-    """Whether JAX computes on a GPU or TPU by default."""
     chosen = jax.default_device.value
     return getattr(chosen, "platform", chosen or jax.default_backend()) != "cpu"
 

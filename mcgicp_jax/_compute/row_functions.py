@@ -318,7 +318,6 @@ class _Gathered:
         return tuple(packs), tuple(numbers)
 
     def used(self, j: int) -> Int[np.ndarray, "n"]:
-        """The different rows of an input."""
         index = self.indices[j]
         if index is None:
             return np.arange(self.size) if self._rows is None else self._rows

@@ -67,11 +67,9 @@ class Packed(Generic[Tree]):
 
 
 class RowsOnDemand(Generic[Tree]):
-    """A pytree of arrays, each row of which is computed once, when it is first needed. Threads may share it.
-
-    `compute` maps row numbers, or None for all rows, and the largest number of threads to NumPy arrays. A row must not
-    depend on the others that are computed with it.
-    """
+    """A pytree of arrays, each row of which is computed once, when it is first needed. Threads may share it. `compute`
+    maps row numbers, or None for all rows, and the largest number of threads to NumPy arrays. A row must not depend on
+    the others that are computed with it."""
 
     def __init__(self, compute: Callable[[Any, int | None], Tree], num_rows: int):
         self._compute, self._lock = compute, threading.Lock()

@@ -146,10 +146,8 @@ def started(call: Callable[[], Answer]) -> Future[Answer]:
 
 
 class ReadAhead(Iterator[Answer]):
-    """The results of `read` until it raises `StopIteration`; a thread reads one ahead while the last one is in use.
-
-    An error is raised in the place of its result, and the iteration may go on.
-    """
+    """The results of `read` until it raises `StopIteration`; a thread reads one ahead while the last one is in use. An
+    error is raised in the place of its result, and the iteration may go on."""
 
     def __init__(self, read: Callable[[], Answer]):
         self._read = read
