@@ -83,8 +83,9 @@ class Matches(NamedTuple):
 
 
 class Matched(eqx.Module):
-    """Both sides of n = m N correspondences, m candidates of N points: the first ones of all points come first. Soft
-    assignment alone has `descriptor_distances`, squared, of α · channel, metres², and a `temperature`, metres."""
+    """Both sides of n = m N correspondences, for m candidates of N source points; the first candidates of all points
+    come first. `descriptor_distances`, squared distances of α · channel, metres², and `temperature`, metres, are those
+    of a soft assignment; None otherwise."""
 
     source: Surface
     target: Surface

@@ -196,7 +196,7 @@ class AbstractExecutor(abc.ABC):
     def nearest(
         self, pose: Float[AnyArray, "7"], source: SearchPoints, alone: bool = True, num_candidates: int = 1
     ) -> Int[AnyArray, "m n"]:
-        """Target rows nearest in position, if not `alone` also in channels; −1: none within the fine `max_distance`."""
+        """Target rows nearest in position, and unless `alone`, in channels; −1 for none within the fine distance."""
 
     @abc.abstractmethod
     def rows(
