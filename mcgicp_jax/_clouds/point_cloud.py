@@ -115,8 +115,13 @@ def _blank(channels: Any, channel_valid: Any) -> Any:
 
 @dataclass(frozen=True)
 class Voxels:
-    """How a cloud was downsampled: edge of the voxels, metres (None: every point is kept), and why ("": it was given).
-    An empty pytree, so that no program depends on it; copies that transformations of JAX make lose it."""
+    """How a cloud was downsampled. An empty pytree, so that no program depends on it; copies that transformations of
+    JAX make lose it.
+
+    Attributes:
+        size: edge of the voxels, metres; None if every point was kept.
+        reason: why this size was chosen; "" if it was given.
+    """
 
     size: float | None = None
     reason: str = ""

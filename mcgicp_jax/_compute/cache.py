@@ -68,8 +68,12 @@ _clouds = Cache(MAX_ROWS, lambda cached: cached.num_rows)
 
 
 def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Parameters, Value]:
-    """Decorator: cache results with the first argument, a cloud, compared by identity; others are pytrees, compared by
-    value. Values live no longer than their cloud, unless they refer to it themselves."""
+    """Decorator of functions whose first argument is a cloud. The key of a result is the cloud, by identity, and all
+    other arguments, pytrees that are compared by value: nothing that the result depends on can be missing in it.
+
+    Values live no longer than their cloud, any object with `points` that can be referenced weakly, unless they refer to
+    it themselves.
+    """
 
     @wraps(compute)
     def cached(*arguments: Parameters.args, **named: Parameters.kwargs) -> Value:

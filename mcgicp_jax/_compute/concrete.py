@@ -27,7 +27,8 @@ else:
 
 
 class Deferred:
-    """A concrete array that is computed when needed: JAX's transformations, copies and pickles get all of it."""
+    """A concrete array that is computed when it is needed. As a pytree it is the whole array: what JAX passes through a
+    transformation, copies or pickles is computed first."""
 
     # Not an `abc.ABC`, for whose subclasses `isinstance` takes ten times as long: it is asked of every array.
     @property

@@ -116,8 +116,13 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
 
 
 class RowAverage(AbstractLinearMap):
-    """Averages of groups of rows: `rows[i]` counts in row `groups[i]` of the result, with those of its entries that are
-    `counted`, (n, C) or (n, 1). `sizes` are the numbers of rows of the array and of the result."""
+    """Each row of the result is the mean of some rows.
+
+    Args:
+        rows, groups: which row counts in which row of the result.
+        counted: (n, C) or (n, 1), which of its entries count.
+        sizes: numbers of rows of the array and of the result.
+    """
 
     def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], counted: Any, sizes: tuple[int, int]):
         ones = np.ones(len(rows))
@@ -228,7 +233,8 @@ mlir.register_lowering(_linear, _not_compiled)
 
 
 def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
-    """The tree, whose derivative by `inputs` is refused: an error where reverse mode uses it, NaN in forward mode."""
+    """The arrays of a tree, which depend on `inputs`, but have no derivative by them: reverse mode raises
+    `NotImplementedError` with the message where it would use it, and forward mode gives NaN."""
     if is_concrete(inputs):
         return tree
     leaves = jax.tree.leaves(inputs, is_leaf=is_deferred)

@@ -49,8 +49,12 @@ _QUICK: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
 
 
 def quickly_compiled(function: Callable[..., Result], *, level: int | None = None) -> Callable[..., Result]:
-    """`jax.jit` on the CPU, for calls outside of other transformations. At `level` 0 of LLVM's optimizations, programs
-    of a few small matrices compile in half the time; at 1, they also run as fast as with all."""
+    """`jax.jit` of a function that is called outside of other transformations; it runs on the CPU.
+
+    Args:
+        level: of LLVM's optimizations, for programs of a few small matrices: without (0), they compile in half the
+            time, and with few (1), they also run as fast as with all.
+    """
     options = _QUICK if level is None else {**_QUICK, "xla_backend_optimization_level": level}
 
     @functools.cache

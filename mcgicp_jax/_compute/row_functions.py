@@ -174,8 +174,12 @@ class RowFunction:
         return [into.get(id(leaf), np.zeros((count, *np.shape(leaf)))) for leaf in leaves]
 
     def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> None:
-        """Add to `into` the cotangents of what is moving, from those of the packed sum, (c, L), or of the rows, (N, c,
-        L), which are 0 but for `rows` (None: any may differ)."""
+        """Add the cotangents of what is moving to `into`.
+
+        Args:
+            cotangents: (c, L) of the sum, packed, or (N, c, L) of the rows.
+            rows: those whose cotangents are not 0; None for all.
+        """
         numbers, *columns = chosen = self._chosen(moving)
         if not any(chosen):
             return
@@ -205,7 +209,8 @@ class RowFunction:
             self._inputs[j].table.vjp(slope, moving, into, gathered.used(j))
 
     def jvp(self, tangents: Slopes, moving: Moving, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
-        """Tangents of the packed sum, (c, L), or of the rows, (n, c, L); a scalar 0 if it depends on nothing moving."""
+        """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of what is moving. A scalar
+        0 if it does not depend on that."""
         numbers, *columns = chosen = self._chosen(moving)
         if not any(chosen):
             return np.zeros(())
@@ -448,8 +453,8 @@ def _found(given: Input) -> Input:
 
 
 def whole(given: Input, rows: Any = None, spread: bool = False) -> Rows:
-    """All rows, or some, of a pytree. For the index −1, the first row, or with `spread` that of the same number: GPUs
-    add the cotangents of a row, zeros included, one after the other."""
+    """All rows, or some, of a pytree of arrays, some of which are traced. Where there is none it is the first, or with
+    `spread` that of the same number: GPUs add the cotangents of a row, zeros included, one after the other."""
     tree, index = jax.tree.map(jnp.asarray, given.table), given.index
     size = len(jax.tree.leaves(tree)[0])
     if index is None and rows is None:

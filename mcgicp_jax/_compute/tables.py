@@ -18,7 +18,13 @@ Tree = TypeVar("Tree")
 
 
 class Layout(NamedTuple):
-    """How a tree of arrays lies in one table. `shapes` lack shared axes; a dtype like the table's is None."""
+    """How a tree of arrays lies in one.
+
+    Attributes:
+        structure: of the tree.
+        shapes: of each array, without the axes that they share.
+        dtypes: of each array; None if it is that of the table.
+    """
 
     structure: Any
     shapes: tuple[tuple[int, ...], ...]
@@ -28,7 +34,12 @@ class Layout(NamedTuple):
 @partial(jax.tree_util.register_dataclass, data_fields=("table",), meta_fields=("layout",))
 @dataclass(frozen=True)
 class Packed(Generic[Tree]):
-    """A tree of arrays in one, (..., L), with the dtype of its floats: integers are exact in it up to 2²⁴."""
+    """A tree of arrays in one; a pytree, whose layout is static.
+
+    Attributes:
+        table: (..., L). Its dtype is that of the floats, if there are any; integers up to 2²⁴ and booleans are exact in
+            it.
+    """
 
     table: Any
     layout: Layout
@@ -67,9 +78,13 @@ class Packed(Generic[Tree]):
 
 
 class RowsOnDemand(Generic[Tree]):
-    """A pytree of arrays, each row of which is computed once, when it is first needed. Threads may share it. `compute`
-    maps row numbers, or None for all rows, and the largest number of threads to NumPy arrays. A row must not depend on
-    the others that are computed with it."""
+    """A pytree of arrays, each row of which is computed once, when it is first needed. Threads may share it.
+
+    Args:
+        compute: maps row numbers, or None for all rows, and the largest number of threads to a pytree of NumPy arrays.
+            A row must not depend on the others that are computed with it.
+        num_rows: number of rows, at least 1.
+    """
 
     def __init__(self, compute: Callable[[Any, int | None], Tree], num_rows: int):
         self._compute, self._lock = compute, threading.Lock()

@@ -38,8 +38,9 @@ _OPEN = {None, "allow"}
 def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
     """Decorator of functions in which JAX has the settings that the package needs, whatever users chose for their code.
 
-    NaN marks missing values here, and the host computes between programs. Products of matrices are in full precision:
-    by default, GPUs round factors to 11 bits (TF32), that is 5 cm at 100 m.
+    Optional checks are off: `debug_nans` and `debug_infs`, since NaN marks missing values here, strict promotion of
+    dtypes and ranks, and guards of transfers, since the host computes between programs. Products of matrices are in
+    full precision: by default, GPUs round factors to 11 bits (TF32), that is 5 cm at 100 m.
     """
 
     @functools.wraps(function)
@@ -126,8 +127,10 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
 
 
 def in_new_thread(call: Callable[[], Answer]) -> Answer:
-    """The result of a call in a thread of its own, without the transformations that are active in this one: inside
-    `jax.grad`, say, each call of a compiled program takes half a millisecond longer."""
+    """The result of a call in a thread of its own, where no transformation of this one is active.
+
+    While one is, as inside `jax.grad`, each call of a compiled program takes half a millisecond longer.
+    """
     return started(call).result()
 
 

@@ -97,8 +97,9 @@ def offsets_of(around: Neighborhoods) -> Offsets:
 def _covariances_of_halves(
     offsets: Offsets, present: Float[Array, "k N"], covariance: Float[Array, "6 N"]
 ) -> tuple[list[Float[Array, "6 N"]], Float[Array, "M"]]:
-    """Covariances of every second neighbour, from the first and from the second on; and the numbers of neighbours: in
-    all, in the first and in the second halves (M = 3 N)."""
+    """Covariances of two halves of each neighbourhood, whose own `covariance` is known: of every second neighbour, from
+    the first and from the second on. And the numbers of neighbours: in all, in the first and in the second halves (M =
+    3 N)."""
     count = jnp.sum(present, axis=0)
     # About the mean of all, so that the sums over one half and over the other add up to those over all.
     x, y, z = (present * (offset - jnp.sum(offset, axis=0) / jnp.maximum(count, 1)) for offset in offsets)
@@ -128,7 +129,8 @@ def cell_edge(cells: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def geometry_of_cells(local: LocalGeometry, covariances: Float[Array, "6 n"], num_candidates: int) -> LocalGeometry:
-    """Local geometry of cells from their covariances, metres²; only the channel fits are those of `local`."""
+    """Local geometry of cells, `num_candidates` of which are matched with each point or cell: from their covariances,
+    metres²; only the channel fits are those of `local`, the geometry of their neighbourhoods."""
     covariances = jax.lax.stop_gradient(covariances)
     normal = alg.smallest_eigenvector(covariances)
     across = alg.inner(normal, alg.multiply(covariances, normal))

@@ -96,7 +96,11 @@ class PointRows(NamedTuple):
 
 
 def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
-    """Inputs for `neighborhoods` in a row function. Without channels, the programs do not depend on their number."""
+    """The points and their neighbours as inputs of a row function, for `neighborhoods`.
+
+    Without channels, the programs do not depend on their number. `with_given` includes the covariances given with the
+    cloud.
+    """
     # Neighbours and `valid`, which differentiation does not trace.
     xp = numpy_for(cloud.deferred_neighbors, cloud.valid)
     neighbors, valid = check_neighbors(cloud, xp), xp.asarray(cloud.valid)
@@ -133,12 +137,14 @@ def neighborhoods(own: Rows, near: Rows | None = None) -> Neighborhoods:
 
 
 class ChannelFits(NamedTuple):
-    """Linear fit of each channel over the tangent plane, in the basis `orthonormal_basis(normal)`.
+    """Linear fit of each channel over the tangent plane, in the basis `orthonormal_basis(normal)`; one row per point.
+
+    Where too few neighbours have the channel, the residual is NaN and the other values are 0.
 
     Attributes:
         gradients: of the fits to every second neighbour, from the first and from the second on, channel units per
-            metre; 0 where too few neighbours have the channel. Their noise is independent.
-        residual: variance of the channel about the fit, channel units²; NaN where too few neighbours have it.
+            metre. Their noise is independent.
+        residual: variance of the channel about the fit, channel units².
         inverse: inverse of the normal matrix (symmetric), 1/metres²: times `residual`, the covariance of the gradient.
     """
 
@@ -171,8 +177,11 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
 
 
 class LinearFit(NamedTuple):
-    """Fits over a plane, with the inverse of the normal matrix and the sum of the weights. Gradient and inverse are 0
-    where the points lie on a line; the residual variance is meaningless for three points or fewer."""
+    """Weighted linear fits over a plane: `inverse` is that of the normal matrix, `weight` the sum of the weights.
+
+    Gradient and inverse are 0 where the points lie on a line; the residual variance is meaningless for three points or
+    fewer.
+    """
 
     gradient: Float[Array, "2 ..."]
     residual: Float[Array, "..."]

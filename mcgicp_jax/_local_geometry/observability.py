@@ -29,8 +29,11 @@ _NOISE = 0.22
 def geometry_observability(
     covariance: Float[Array, "6 N"], normal: Float[Array, "3 N"], count: Float[Array, "N"]
 ) -> Float[Array, "6 N"]:
-    """Observability (n nᵀ − V) (1 − tr V) from one normal n, whose covariance is V. n is the eigenvector of the
-    smallest eigenvalue of `covariance`, that of `count` neighbours, metres²."""
+    """Observability from one normal n: (n nᵀ − V) (1 − tr V), with the covariance V of n.
+
+    `covariance` is that of `count` neighbours about their mean, metres², and n its eigenvector of the smallest
+    eigenvalue.
+    """
     certain, variance = _certainty(covariance, normal, count)
     return certain * (alg.outer(normal) - variance)
 
@@ -45,7 +48,10 @@ def observability_of_halves(
     the certainties of both normals, which are also independent: the certainty of the normal of all neighbours would be
     larger where both halves deviate alike. Where a half is not usable: `geometry_observability` of all neighbours.
 
-    The M = 3 N columns are those of all neighbours, of the first and of the second halves; L = 2 N: of both halves.
+    Args:
+        covariances, normals, counts: as in `geometry_observability`, of all neighbours, of the first halves, and of the
+            second halves; M = 3 N.
+        usable: whether the normal of each half may be used; L = 2 N.
     """
     certain, variance = _certainty(covariances, normals, counts)
     (whole, *of_halves), (normal, first, second) = jnp.split(certain, 3), jnp.split(normals, 3, axis=1)
@@ -102,7 +108,8 @@ def channel_observability(
     its square would also subtract the misfit at sharp edges: on a wall of posters, the sum along a direction that was
     known to a millimetre was negative.) Each half needs three neighbours; with fewer, the observability is 0.
 
-    Also returned: the means of g and h, and the summed variances of the descriptors about the fits, metres².
+    `weights` are α, metres per channel unit. Also returned are the gradients of the descriptors, means of both fits,
+    and the variance of the descriptors about their linear fits, metres², summed over the channels.
     """
     (gx, gy), (hx, hy) = fits.gradients.transpose(2, 3, 1, 0)
     square = (weights * weights)[:, None]

@@ -31,11 +31,11 @@ def sampled_rows(valid: Any, most: int = MEDIAN_ROWS) -> tuple[Any, Any]:
 
 
 def spread_rows(valid: Any, count: int) -> Any:
-    """One valid row from each of `count` equal runs of a larger cloud, in order; if too few are valid, padding follows.
+    """`count` valid rows of a cloud with more rows than that, in order: one from each of `count` equal runs.
 
-    Rows sorted by voxel, as `preprocess` leaves them, are spread evenly in space, others as densely as the points.
-    Places in the runs are random, with a fixed seed: at a constant stride, all rows of an organised scan could be from
-    one line.
+    Rows sorted by voxel, as `preprocess` leaves them, are spread evenly in space, others as densely as the points. The
+    place in each run is random with a fixed seed: with a constant stride, all rows of an organised scan could be from
+    one scan line. `valid`, (N,), is False for padding; if fewer than `count` are True, rows of padding follow.
     """
     xp = numpy_for(valid)
     valid_first = xp.argsort(~xp.asarray(valid), stable=True)

@@ -163,8 +163,14 @@ def voxel_cells(
 
 
 class _Cells:
-    """The points of a cloud sorted by cell, `order` (N,), and moments of the M cells, as columns: `spread` (6, M) is
-    the covariance, and `kept` is False for cells that are left out."""
+    """The points of a cloud sorted by cell, and the moments of each cell.
+
+    Attributes:
+        order: (N,) point numbers, sorted by cell.
+        counts: (M,) number of points in each cell.
+        kept: (M,) False for cells that are left out.
+        means, spread: (3, M), and (6, M) covariances as rows xx, xy, xz, yy, yz, zz.
+    """
 
     def __init__(self, cloud: PointCloud, voxel_size: float, min_points: int, channel_size: Values | None):
         check_positive("voxel_size", voxel_size)

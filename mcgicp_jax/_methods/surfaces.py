@@ -44,8 +44,14 @@ SURFACE, NOISE, SEARCH = range(3)
 
 @dataclass(frozen=True, eq=False)
 class SurfaceTable:
-    """The surface of a concrete cloud, whose rows are computed when they are used: all rows in `table`, with `noise` if
-    `observed`, and those of `rows` (None: all) in `search`."""
+    """The surface of a concrete cloud, whose rows are computed when they are used.
+
+    Attributes:
+        table: of `Surface`, and of its `noise` if `observed`.
+        rows: (n,) those that are used; None for all.
+        search: the points, those of `rows`, as input of the search.
+        observed: as in `surface_pair`.
+    """
 
     table: ComputedTable
     rows: Any
@@ -80,7 +86,13 @@ else:
 
 
 class SurfacePair(NamedTuple):
-    """Two clouds as the input of a registration by a resolved method; tables if everything is concrete."""
+    """Two clouds as the input of a registration.
+
+    Attributes:
+        method: with its unset parameters chosen from the data.
+        terms: the residuals of each correspondence.
+        source, target: the surfaces of both clouds; tables if everything is concrete.
+    """
 
     method: AbstractMethod
     terms: tuple[AbstractTerm, ...]
@@ -117,11 +129,14 @@ def surface_pair(
     num_threads: int | None = 1,
     source_rows: Any = None,
 ) -> SurfacePair:
-    """Choose unset parameters and compute both surfaces, of the source only `source_rows` (None: all).
+    """Choose unset parameters from two clouds, and compute their surfaces.
 
-    Rows of concrete clouds are computed on the host when they are used, from neighbours among all points, and cached.
-    Traced clouds share one compiled body, unless they are large. `register` needs observability (`observed`); the cost
-    of given matches does not.
+    Rows of concrete clouds are computed on the host when they are used, and are cached with each cloud. Inside
+    transformations both clouds share one compiled body, unless they are large.
+
+    Args:
+        observed: whether to compute observability, which `register` needs and the cost of given matches does not.
+        source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
     used = source if source_rows is None else _some_rows(source, source_rows)
     whole = cache(partial(local_geometries, source, target, method.uses_channels, (source_rows, None), num_threads))

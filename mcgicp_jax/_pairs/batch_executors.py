@@ -48,6 +48,7 @@ _START, _MEMORY = 3.2, 2**29
 
 
 def executor_of(executor: GivenExecutor) -> ChosenExecutor:
+    """The executor to use; `ValueError` unless it is None, "processes", "threads" or an executor that may run JAX."""
     if isinstance(executor, str) and executor == "processes":
         return Processes(num_cores())
     if isinstance(executor, str) and executor == "threads":
@@ -166,8 +167,13 @@ def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int 
 
 
 class _Start:
-    """The start of processes for the rest of a batch, if they pay. `processes`: None until they are started, and if
-    they cannot run the job. `idle`: seconds that processes would not save: the caller had results or made pairs."""
+    """The start of processes for the rest of a batch, if they pay.
+
+    Attributes:
+        finished: number of pairs that threads have registered.
+        idle: seconds in which the caller had the results, or made the next pair; processes would not save them.
+        processes: None until they are started, and if they cannot run the job.
+    """
 
     def __init__(self, job: BatchJob, count: int | None):
         self._job, self._count = job, count
@@ -190,7 +196,8 @@ class _Start:
             self.idle += time.perf_counter() - begin
 
     def has_ended(self, pair: Pair) -> bool:
-        """Whether the processes run; starts them if they pay, and tries to send the next `pair`."""
+        """Whether the processes run; starts them if they pay. `pair` is the next one, of which it is tried whether it
+        can be sent."""
         if not self._possible:
             return False
         try:
@@ -232,9 +239,14 @@ class _Start:
 
 
 class ChunkedExecutor:
-    """Chunks of pairs submitted to an executor. A chunk may fail because one of its pairs killed the worker, or because
-    another chunk broke the pool. Pairs of failed chunks are suspects, submitted again at the end one by one: only those
-    that fail alone get `WORKER_FAILED`. `at_home`: pairs that cannot be sent run in this process."""
+    """Chunks of pairs submitted to an executor, and pairs to retry.
+
+    A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
+    failed chunks are suspects, submitted again at the end one by one: only those that fail alone get `WORKER_FAILED`.
+
+    Args:
+        at_home: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
+    """
 
     def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False):
         self._executor, self._at_home = executor, job if at_home else None

@@ -78,7 +78,8 @@ class PairWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Pair:
-    """`traced`: numbers of leaves of clouds, method and kernel to differentiate by; if any, clouds are preprocessed."""
+    """The arguments of one pair. `traced` numbers the leaves of clouds, method and kernel by which the pose is to be
+    differentiated; if there are any, the clouds are preprocessed."""
 
     index: int
     source: Cloud
@@ -90,8 +91,13 @@ class Pair:
 
 @dataclass(frozen=True)
 class PairResult:
-    """`reason`: why there is no pose, or an UNVERIFIED one; None otherwise, or if the status says it. `warnings`:
-    issued in another process. `jacobian`: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`."""
+    """The result of one pair.
+
+    Attributes:
+        reason: why it has no pose; None if it has one, or the status is the reason.
+        warnings: issued in another process.
+        jacobian: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`.
+    """
 
     index: int
     registration: RegistrationResult
@@ -100,6 +106,7 @@ class PairResult:
     jacobian: tuple[np.ndarray, ...] = ()
 
     def with_warning(self) -> PairResult:
+        """The result; issues the warnings, and a `PairWarning` if there is a reason for it."""
         for message in self.warnings:
             warn(message)
         reason = self.reason or doubt_of(self.registration)
@@ -275,7 +282,8 @@ class BatchJob:
         return self._result(pair.index, pair.checked(result), pair.doubt or run.doubt)
 
     def register_in_chunks(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
-        """One thread prepares small pairs, several the others; these repeat pairs that may have left a right start."""
+        """Register the pairs in chunks on this machine. One thread prepares those of small clouds, several the others;
+        these also register pairs again that may have left a right initial pose."""
         # On the host neighbours are needed for warnings alone, of a sample of points.
         on_host = replace(self, options=replace(self.options, search=default_search(workers=1)))
         unchecked = replace(on_host, checked=False)

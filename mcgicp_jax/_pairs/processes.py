@@ -39,7 +39,8 @@ _LOOK = 1.0
 
 
 class Processes(Executor):
-    """Single-threaded loky workers, which need no `__main__` guard; batches share them until the interpreter ends."""
+    """Single-threaded workers in other processes, from loky: they need no `__main__` guard, and wait for further calls
+    until the interpreter ends. All batches of this process share them."""
 
     # Chunks of all batches that have not ended, with their batches.
     _unfinished: ClassVar[dict[Future[Any], Processes]] = {}
@@ -69,7 +70,8 @@ class Processes(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Futures in loky's queue cannot be cancelled: workers are ended instead, unless another batch uses them."""
+        """Cancel the futures of this batch, if so wanted. Those in loky's queue cannot be cancelled: the workers are
+        ended instead, unless they are at work for another batch."""
         if not cancel_futures:
             return
         unfinished = dict(self._unfinished)

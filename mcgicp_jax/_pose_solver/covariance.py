@@ -93,13 +93,18 @@ def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:
 def discounts_and_radius(
     sample: NoiseSample, num_channels: Int[AnyScalar, ""]
 ) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
-    """Factors, 0.2 to 1, that reduce observability by geometry and by channels; median neighbourhood radius.
+    """(2,) factors, 0.2 to 1, by which observability must be reduced: of the geometry and of the channels; and the
+    median distance to the farthest neighbour, metres.
 
     On a rough surface the nearest neighbour is one whose height resembles that of the point. Model the height b of a
     match as b = βa + e, with equal roughness on both sides. Then var(b − a) is (1 − β) times the sum of both
     roughnesses, and the match follows a fraction β of any motion. The ratio of observed to expected variance therefore
     estimates the observable fraction 1 − β. The same holds for noisy channels. Medians, since the plane fits fail at
-    edges. `num_channels` counts those with a nonzero weight α.
+    edges.
+
+    Args:
+        sample: of matches.
+        num_channels: number of channels with a nonzero weight α.
     """
     xp = numpy_for(sample, num_channels)
     seen, expected, quotient, neighborhood_radius = median(xp.stack([xp.asarray(column) for column in sample]))
@@ -219,8 +224,14 @@ def _cells(
 
 
 class Moments(NamedTuple):
-    """Sums over the scores of all correspondences: those of `Scores`, Σ_c u_c u_cᵀ, and the number of cells with valid
-    ones. `rounding` is the covariance of positions since coordinates are rounded to coarse steps, metres²."""
+    """Sums over the scores of all correspondences.
+
+    Attributes:
+        jacobian, bias: see `Scores`.
+        scatter: Σ_c u_c u_cᵀ.
+        num_cells: number of cells with valid correspondences.
+        rounding: covariance of positions since coordinates are rounded to coarse steps, metres².
+    """
 
     jacobian: Float[AnyArray, "6 4 4"]
     bias: Float[AnyArray, "6"]

@@ -97,8 +97,12 @@ class Directions(eqx.Module):
 
 def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) -> Directions:
     """Eigenvectors of the observed fraction of the points' motion: by the geometry, and among the directions that
-    geometry does not constrain, by the channels. Fractions do not depend on units or on the origin. Twists orthogonal
-    to the rows of `constraints`, which may be 0, are free; the other directions are fixed."""
+    geometry does not constrain, by the channels. Fractions do not depend on units or on the origin.
+
+    Args:
+        constraints: rows that are orthogonal to the free twists, and rows of zeros. Eigenvectors are those within the
+            free twists; the other directions are fixed. None if all are free.
+    """
     if sums.mass is None or sums.observability is None:
         raise ValueError("sums: expected those of surfaces with observability")
     center, radius = sums.center, sums.radius

@@ -31,10 +31,12 @@ class ImplicitRoot(eqx.Module):
     derivative of the pose follows from g, including the dependence of M and w on the pose.
 
     Where directions are unconstrained, the loop converges to a root of Pᵀ g: the columns of P are twists along the
-    constrained directions, and the pose moves along these alone, as in `solve_update`. P is constant to autodiff, as
-    the matches are: its own change is multiplied by forces along unconstrained directions, which are arbitrary.
+    constrained directions, and the pose moves along these alone, as in `solve_update`. P is a constant to autodiff, as
+    the matches are: what it contributes is the forces along unconstrained directions, which are arbitrary, times its
+    own change.
 
     Attributes:
+        center, radius: `Sums.center` and `Sums.radius` at the returned pose, metres.
         scale: tr(Σ K) · radius²; g is divided by it to be dimensionless.
         usable: whether a root is to be searched; if False, the derivative is zero.
         columns: P, lengths in units of the radius, with zeros for unconstrained directions. If there are none, I.
@@ -84,10 +86,15 @@ class Model(NamedTuple):
 
 @jax.custom_jvp
 def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "7"]:
-    """The pose, with the derivative −P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ ∂g/∂θ of the nearby root of Pᵀ g by θ, the `model`.
+    """Return the pose, with the derivative −P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ ∂g/∂θ of the nearby root of Pᵀ g (implicit function
+    theorem).
 
-    It is evaluated at the root, which Newton's method finds from the pose, and zero if `root.usable` is False or
-    Newton's method does not converge. A second derivative raises `NotImplementedError`.
+    The derivative is evaluated at the root, which Newton's method finds from the pose. It is zero if `root.usable` is
+    False or Newton's method does not converge. A second derivative raises `NotImplementedError`.
+
+    Args:
+        pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
+        model: θ, the differentiable inputs.
     """
     return pose
 

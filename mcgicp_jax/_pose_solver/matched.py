@@ -46,10 +46,13 @@ class Motion(NamedTuple):
 
 
 class Matches(NamedTuple):
-    """Target rows of m candidates for n source points; −1 where there is none, or a point does not count.
+    """Candidates in the target for n source points.
 
-    `max_distance`, metres, is applied when the matches are used, so that they may follow a pose. `rows` are the source
-    points among all rows; None: all. `temperature` is that of a soft assignment, metres.
+    Attributes:
+        indices: target rows of the m candidates; −1 where there is none, or a point does not count.
+        max_distance: metres; applied when the matches are used, so that they may follow a pose.
+        rows: the source points among all rows; None for all of them.
+        temperature: of a soft assignment, metres; None without one.
     """
 
     indices: Int[AnyArray, "m n"]
@@ -83,9 +86,15 @@ class Matches(NamedTuple):
 
 
 class Matched(eqx.Module):
-    """Both sides of n = m N correspondences, for m candidates of N source points; the first candidates of all points
-    come first. `descriptor_distances`, squared distances of α · channel, metres², and `temperature`, metres, are those
-    of a soft assignment; None otherwise."""
+    """Both sides of n correspondences; n = m N for m candidates of N source points.
+
+    Attributes:
+        source, target: rows of the surfaces; the first candidates of all source points come first.
+        valid: (n,) False for correspondences to ignore.
+        descriptor_distances: (n,) squared distances of descriptors α · channel, metres²; only for soft assignment.
+        temperature: of the soft assignment, metres; None otherwise.
+        num_candidates: m.
+    """
 
     source: Surface
     target: Surface

@@ -34,8 +34,10 @@ class TiePoints(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians. Rows f of `fixed`,
-    (6, 6), fix f · ξ = 0 or are zeros; constant to autodiff; None if no direction is fixed."""
+    """The pose is R, t times exp(ξ) with ξ = (v, ω) of the given information, metres and radians.
+
+    `fixed`: (6, 6), rows f with f · ξ = 0 and rows of zeros; None if no direction is fixed. A constant to autodiff.
+    """
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]
@@ -44,8 +46,13 @@ class Prior(NamedTuple):
 
 
 class PoseForm(NamedTuple):
-    """Costs of tie points, Q and G with D flattened row by row and Δt in units of the radius; and of a prior, relative
-    to the source point at c and to c, lengths in units of the radius: without one, its information is 0."""
+    """Costs of tie points and of a prior.
+
+    Attributes:
+        stiffness, force: Q and G, with D flattened row by row and Δt in units of the radius.
+        prior: relative to the source point at c and to c, lengths in units of the radius; without one its information
+            is 0.
+    """
 
     stiffness: Float[AnyArray, "12 12"]
     force: Float[AnyArray, "12"]
@@ -81,9 +88,15 @@ def form_at(
 
 
 class PoseMeasurements(eqx.Module):
-    """Tie points and a prior as a force γ(T) on the pose; `form` refers to T₀, `rotation` and `translation`. Twists
-    turn about `center`, in the target's frame, with lengths in units of `radius`; both are of the points matched at T₀,
-    metres."""
+    """Tie points and a prior as a force on the pose, γ(T).
+
+    Twists turn about `center`, in the target's frame, with lengths in units of `radius`.
+
+    Attributes:
+        rotation, translation: T₀, the pose to which `form` refers.
+        center, radius: of the points that are matched there, metres.
+        form: of tie points and prior.
+    """
 
     rotation: Float[AnyArray, "3 3"]
     translation: Float[AnyArray, "3"]

@@ -31,19 +31,25 @@ _SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability"
 class Sums(NamedTuple):
     """Sums over correspondences, see the module. The centre c is the centroid of the moved, matched source points.
 
-    Taken about this centre and at the current pose, the sums remain precise in float32. Symmetric 3×3 matrices are
-    stored as upper triangles, h hᵀ is stored whole.
+    Taken about this centre and at the current pose, the sums remain precise in float32. Symmetric 3×3
+    matrices are stored as upper triangles, h hᵀ is stored whole.
 
     Attributes:
+        center: c, metres.
         count: number of correspondences; every candidate counts.
         square_extent: Σ |p|², metres².
-        energy, cost, force, stiffness: e, Σ ρ, G, Q.
+        energy: e.
+        cost: Σ ρ.
         square_distance: Σ |d|² of the mean over the candidates of a source point, metres².
+        num_matched: number of source points with a match.
+        force: G.
+        stiffness: Q.
         mass: Σ w h hᵀ without points near the sensor, as the following; None where observability is not known.
-        observability: Σ w O ⊗ h hᵀ by shape, less that of points near the sensor; None where it is not known.
+        observability: Σ w O ⊗ h hᵀ by the shape of the surfaces, less that of points near the sensor; None where it is
+            not known.
         channel_observability: the same by the channels; None also where they are not used.
-        agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where slopes
-            are not known, as before the last step.
+        agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where the
+            slopes are not known, as before the last step.
         surplus: the same by the surplus of gradients across the lines of sight; 0 where the slopes are not known.
     """
 
@@ -87,12 +93,16 @@ def sums_of(
     near: Float[AnyScalar, ""],
     last: Bool[AnyScalar, ""],
 ) -> Sums:
-    """The sums at a pose in one pass over the correspondences, the only part of a step that touches points.
+    """Compute the sums at a pose in one pass over the correspondences, the only part of a step that touches points.
 
     All sums but those for the centre are rows of one product with h hᵀ: sums of their own would be programs of several
-    loops each, which evaluate the same expressions again. Source points within `near` metres of the sensor, the origin
-    of their frame, may be the sensor's own vehicle, which moves with it. By shape they count against a motion, which
-    they would hold wherever others say less; their channels do not count.
+    loops each, which evaluate the same expressions again.
+
+    Args:
+        near: metres; source points within this distance of the sensor, the origin of their frame, may be the sensor's
+            own vehicle, which moves with it. By shape they count against a motion, which they would hold wherever
+            others say less; their channels do not count.
+        last: whether the loop ends with these sums, see `observability`.
     """
     posed, found, counts = linearize_at(motion, matched, terms)
     mask = jnp.asarray(matched.valid).astype(posed.moved.dtype)
@@ -173,8 +183,8 @@ def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
 def observability(
     posed: PosedMatches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]
 ) -> list[Float[Array, "6 n"]]:
-    """O per correspondence, in the target's frame, mean over its two points: by shape; where channels are used, by
-    channels; and if surfaces have `noise` with slopes, by the agreement of the channels, and its surplus.
+    """O per correspondence, in the target's frame: mean over its two points, by shape, and where channels are used, by
+    channels; then, if the surfaces have `noise` with slopes, by the agreement of the channels, and its surplus.
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
     cell. For cells it is therefore the product of both, whose noise is independent, less what they have in common by

@@ -40,8 +40,13 @@ _TANGENT = (
 
 
 class Update(eqx.Module):
-    """The moved points turn by exp(ω) about the centre and shift by v, `twist` = (v, ω), metres and radians.
-    `information` is Σ JᵀKJ, lengths in units of the radius; it is singular to rounding if `degenerate`."""
+    """Result of one pose update.
+
+    Attributes:
+        twist: (6,) ξ = (v, ω), metres and radians: the moved points turn by exp(ω) about the centre and shift by v.
+        information: (6, 6) Σ JᵀKJ for ξ, lengths in units of the radius.
+        degenerate: whether `information` is singular to rounding.
+    """
 
     twist: Float[Array, "6"]
     information: Float[Array, "6 6"]
@@ -51,12 +56,17 @@ class Update(eqx.Module):
 def solve_update(
     sums: Sums, basis: Float[Array, "6 6"], others: tuple[Float[Array, "6"], Float[Array, "6 6"]] | None = None
 ) -> Update:
-    """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ over the pose change D = [ΔR − I | Δt], see `sums`.
+    """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ (symbols as in `sums`) over the pose change D =
+    [ΔR − I | Δt], with M and w fixed.
 
-    M and w are fixed. Levenberg-Marquardt runs on 13 residuals, a square root of the quadratic form in (vec D, 1), so
-    its time does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts translation and
-    rotation on the same scale for clouds of any size. Columns of `basis` are twists along which the pose may move; zero
-    columns keep it fixed. `others` are force and stiffness of other measurements.
+    Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D, 1), so its time
+    does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts translation and rotation
+    on the same scale for clouds of any size.
+
+    Args:
+        basis: (6, 6), columns: twists along which the pose may move, lengths in units of the radius. Zero columns
+            keep the pose fixed along their directions.
+        others: force and stiffness of other measurements of the pose, for its twist, lengths in units of the radius.
     """
     radius, dtype = sums.radius, sums.center.dtype
     form = _quadratic_form(sums, radius)
@@ -202,9 +212,11 @@ def _semidefinite_root(form: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], 
 
 @jax.jit
 def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Float[Array, "6 6"]]) -> Float[Array, "13"]:
-    """13 residuals whose squares sum to the quadratic form; a rotation is given by 2 s, twice its Rodrigues vector.
+    """13 residuals whose squares sum to the quadratic form. The rotation is parametrised by 2 s, with the Rodrigues
+    vector s = tan(θ/2) a of angle θ and axis a; to first order, 2 s is the rotation vector.
 
-    ΔR − I = 2 (S + S²) / (1 + s·s) with S = [s]× (Cayley). The exponential map would double what an update compiles.
+    ΔR − I = 2 (S + S²) / (1 + s·s) with S = [s]× (Cayley). The exponential map, with square roots and special cases,
+    would double what an update compiles.
     """
     root, basis = args
     twist = basis @ along

@@ -69,10 +69,14 @@ class Problem(eqx.Module):
     """Inputs of the registration loop.
 
     Attributes:
+        start: the initial pose.
+        source, target: the surfaces of both clouds.
         terms: the residuals of each correspondence, before any number is adapted.
-        measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`.
+        measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`; None
+            if there are none.
         fixed: the prior if it fixes directions, else None.
         matches: those of `estimate_pose`, at every pose; None if the loop searches for them.
+        num_candidates: number of target points that a source point is matched with.
         temperature: of the soft matches by which the final pose is differentiated, metres; None for those of the loop.
         widens_kernels: whether kernels are wide in the coarse phase: those of the user, not those of a method.
     """
@@ -139,11 +143,13 @@ class State(NamedTuple):
     Attributes:
         pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
         status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
-        since: sum of the updates since the last iteration whose number is a power of two, metres and radians.
+        num_iterations: number of updates so far.
+        since: (6,) sum of the updates since the last iteration whose number is a power of two, metres and radians.
         extent: largest cost, over these updates, of moving the matched points by `since`.
         sums: at the pose before the update; this and the following are None before the first step on the host.
-        information: there, about the centroid, lengths in units of the radius.
-        directions: there, about the centroid; None for `estimate_pose`.
+        information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
+        directions: at the pose before the update, about the centroid; None for `estimate_pose`.
+        record: of this step.
     """
 
     pose: jaxlie.SE3
@@ -158,8 +164,14 @@ class State(NamedTuple):
 
 
 class LoopResult(NamedTuple):
-    """The loop after some steps, with matches (None before the first step) and terms at the pose before the last
-    update, and records of the steps: inside transformations, one entry for each possible step."""
+    """The loop after some steps.
+
+    Attributes:
+        state: after the last step.
+        matches: at the pose before the last update; None before the first.
+        terms: as they were at that pose.
+        history: records of the steps; arrays with one entry for each possible step inside transformations.
+    """
 
     state: State
     matches: Any

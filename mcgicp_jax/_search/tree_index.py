@@ -57,9 +57,16 @@ class TreeIndex(AbstractIndex):
     def nearest_of(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"] | None, max_distance: float, k: int
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest target rows, −1 for none; and the slack: metres that a query may move before they can change,
-        but for their order. Queries are positions and descriptors, metres; those that are not finite have no
-        neighbours."""
+        """The k nearest rows of each query.
+
+        Args:
+            queries: positions and descriptors, metres; rows that are not finite have no neighbours.
+            penalty: of the queries, as in `SearchPoints`.
+
+        Returns:
+            (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
+            k nearest rows can change, but for their order.
+        """
         indices, slack = np.full((len(queries), k), -1, np.int32), np.zeros(len(queries))
         if not self._rows.size:
             return indices, slack
