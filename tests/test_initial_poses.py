@@ -50,9 +50,7 @@ def test_a_right_initial_pose_is_kept_or_the_result_unverified_in_sparse_rooms(c
 def test_a_pose_is_unverified_if_another_one_explains_the_surfaces_as_well():
     """A sparse room, 1 m off, where the surfaces coincide as well as at the truth, where the pose begins."""
     pair = office(9, 1000)
-    with pytest.warns(
-        UserWarning, match=r"with a smaller max_distance the same initial pose leads \S+ m away, where surfaces"
-    ):
+    with pytest.warns(UserWarning, match=r"to poses \S+ m apart, at which surfaces coincide about as well"):
         result = mcg.register(pair.source, pair.target, GICP)
     assert error(result) > 0.5 and result.status is Status.UNVERIFIED
 
@@ -154,9 +152,7 @@ def test_narrow_kernels_begin_wide_inside_jit(corner):
 def test_poses_are_unverified_where_a_wrong_one_has_more_inliers(field):
     """1.3 m from the truth more points of these views lie on surfaces than at the truth, where the pose begins."""
     pair = views(2, field)
-    with pytest.warns(
-        UserWarning, match="fewer than 60% of the source points lie on the target, and (the result|with a smaller)"
-    ):
+    with pytest.warns(UserWarning, match="fewer than 60% of the source points lie on the target, and different values"):
         result = mcg.register(pair.source, pair.target, GICP, init=pair.T_target_source)
     assert error(result, pair.T_target_source) > 1 and result.status is Status.UNVERIFIED
     (same,) = mcg.register_batch([pair.source], [pair.target], GICP, init=[pair.T_target_source])

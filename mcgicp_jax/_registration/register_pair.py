@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from typing import Any, NamedTuple, cast
 
 import jax
@@ -59,7 +59,6 @@ from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
     BETTER,
     CLOSE,
-    GOOD_FIT,
     LITTLE_IN_COMMON,
     distance_moved,
     doubt_of_start,
@@ -361,28 +360,29 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
     doubt = doubt_of_start(start, state, settings, partial(surface_fit, run.inputs, executor, run.loop), at_scales)
     if doubt is None:
         return run, ""
-    fit, overlap, little, few = doubt
-    found = [(run, fit, overlap)]
-    for fraction in (1.0, CLOSE) if few and not little else (1.0,):
+    # All are measured within the same distance.
+    runs, fits = [run], [doubt.fit]
+    for fraction in (1.0, CLOSE) if doubt.few and not doubt.little else (1.0,):
         other = closely(fraction * float(settings.fine_distance))
         if other.loop.state.status in USABLE:
-            found.append((other, *surface_fit(run.inputs, executor, other.loop)))
-
-    def evident(one: tuple[Any, ...], other: tuple[Any, ...], factor: float) -> bool:
-        comparable = one[2] <= other[2] or one[1] > GOOD_FIT
-        return bool(comparable and one[1] * one[2] > factor * other[1] * other[2])
-
-    best = reduce(lambda before, after: after if evident(after, before, BETTER) else before, found)
-    common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if little else ""
-    taken = "the result is that of a smaller max_distance, and " if best[0] is not run else ""
-    reason = f"{common}registration with a smaller max_distance fails" if little and len(found) == 1 else ""
-    for each in found:
-        apart = distance_moved(best[0].loop.state.pose, each[0].loop.state)
-        if apart > settings.fine_distance and (little or evident(each, best, 1 / BETTER if few else 1.0)):
-            which = "another" if taken else "a smaller"
-            reason = f"{common}{taken}with {which} max_distance the same initial pose leads {apart:.2g} m away"
-            reason = reason if little else f"{reason}, where surfaces coincide about as well"
-    return best[0], reason
+            runs.append(other)
+            fits.append(surface_fit(run.inputs, executor, other.loop))
+    best = 0
+    for i, fit in enumerate(fits):
+        best = i if fit.exceeds(fits[best], BETTER) else best
+    margin = 1 / BETTER if doubt.few else 1.0
+    rivals = [run for run, fit in zip(runs, fits, strict=True) if doubt.little or fit.exceeds(fits[best], margin)]
+    apart = max((distance_moved(runs[best].loop.state.pose, rival.loop.state) for rival in rivals), default=0.0)
+    common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
+    reason = ""
+    if doubt.little and len(runs) == 1:
+        reason = f"{common}registration with a smaller max_distance fails"
+    elif apart > settings.fine_distance:
+        reason = (
+            f"{common}different values of max_distance lead from the same initial pose to poses {apart:.2g} m apart"
+        )
+        reason += "" if doubt.little else ", at which surfaces coincide about as well"
+    return runs[best], reason
 
 
 def _equalized(given: Inputs, matches: Correspondences | None = None) -> Inputs:

@@ -9,7 +9,7 @@ common, the surfaces may coincide there, too, and neither pose can be promised.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast
+from typing import NamedTuple, cast
 
 import jaxlie
 import numpy as np
@@ -54,33 +54,64 @@ LITTLE_IN_COMMON = 0.6
 _SAMPLE = 1024
 
 
+class SurfaceFit(NamedTuple):
+    """How well the surfaces of two clouds coincide at a pose.
+
+    Attributes:
+        fit: (a/m)², for the agreement a and the misfit m, at least 1, of the surfaces of matched points, see
+            `agreement_of`; 0 without matches.
+        overlap: fraction of the source points that lie on the target, in position.
+    """
+
+    fit: AnyScalar
+    overlap: AnyScalar
+
+    def exceeds(self, other: SurfaceFit, factor: float) -> bool:
+        """Whether the evidence for this pose, overlap times fit, is more than `factor` times that for another one. Of
+        more matches, which may lie beyond a cut, it is not, unless they fit well."""
+        comparable = self.overlap <= other.overlap or self.fit > GOOD_FIT
+        return bool(comparable and self.fit * self.overlap > factor * other.fit * other.overlap)
+
+
+class Doubt(NamedTuple):
+    """Why a registration may have left a right initial pose.
+
+    Attributes:
+        fit: at its pose.
+        little: whether the views have little in common.
+        few: whether there are few matches.
+    """
+
+    fit: SurfaceFit
+    little: bool
+    few: bool
+
+
 def doubt_of_start(
     start: jaxlie.SE3,
     state: State,
     settings: Settings,
-    measure_fit: Callable[[], tuple[AnyScalar, AnyScalar]],
+    measure_fit: Callable[[], SurfaceFit],
     at_scales: bool = False,
-) -> tuple[AnyScalar, AnyScalar, bool, bool] | None:
-    """If a registration may have left a right initial pose: its `surface_fit`, computed by `measure_fit`, whether the
-    clouds have little in common, and whether there are few matches; else None.
+) -> Doubt | None:
+    """The doubt of a registration, if there is any; `measure_fit` computes the `surface_fit` at its pose.
 
-    It may have done so if it has moved the points by more than the fine `max_distance`, and surfaces do not coincide at
-    its pose, or have little in common. (At several scales the initial pose is known to be far off, where the fine
-    distance leads nowhere.)
+    It may have left a right initial pose if it has moved the points by more than the fine `max_distance`, and surfaces
+    do not coincide at its pose, or have little in common. (At several scales the initial pose is known to be far off,
+    where the fine distance leads nowhere.)
     """
     if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
         return None
     if distance_moved(start, state) <= settings.fine_distance:
         return None
-    fit, common = measure_fit()
-    little = bool(common < LITTLE_IN_COMMON) and not at_scales
+    fit = measure_fit()
+    little = bool(fit.overlap < LITTLE_IN_COMMON) and not at_scales
     few = bool(state.record.num_inliers < _MANY)
-    return (fit, common, little, few) if fit < (GOOD_FIT if few else LEAST_FIT) or little else None
+    return Doubt(fit, little, few) if fit.fit < (GOOD_FIT if few else LEAST_FIT) or little else None
 
 
-def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> tuple[AnyScalar, AnyScalar]:
-    """(a/m)² at the end of a registration, for the agreement a and the misfit m ≥ 1 of matched surfaces, see
-    `agreement_of`; 0 without matches. And the fraction of the source points that have a match."""
+def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> SurfaceFit:
+    """At the pose of a loop, matched within the fine `max_distance` of the executor."""
     points, others = executor.problem.source.points, executor.problem.target.points
     rows, counts = sampled_rows(executor.problem.source.search.valid, _SAMPLE)
     # In position alone: matches in position and channels lie further apart, also at right poses.
@@ -93,7 +124,7 @@ def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) ->
     turned = motion._replace(translation=np.zeros(3, points.dtype)).move(source.normal).T
     offsets, thicknesses = others[targets] - motion.move(points[rows]).T, (_thickness(source), _thickness(target))
     misfit, agreement = agreement_of(offsets, (turned, target.normal), thicknesses, matched)
-    return (agreement / xp.maximum(misfit, 1)) ** 2, xp.sum(matched) / xp.maximum(xp.sum(counts), 1)
+    return SurfaceFit((agreement / xp.maximum(misfit, 1)) ** 2, xp.sum(matched) / xp.maximum(xp.sum(counts), 1))
 
 
 def _thickness(local: LocalGeometry) -> Float[AnyArray, "n"]:
