@@ -159,6 +159,35 @@ def test_rays_without_return_are_left_out(place, count, kept):
     np.testing.assert_array_equal(slopes, np.tile(keep[:, None], 3))
 
 
+# How many rows of a cloud lie at which place, beside 400 points of two walls.
+PLACES = {
+    "zeros and one place": [((0, 0, 0), 90), ((9, 9, 9), 40)],
+    "two places": [((9, 9, 9), 40), ((-9, 9, 9), 30)],
+    "a frequent and a rare place": [((9, 9, 9), 300), ((-9, 9, 9), 8)],
+    "a place beside zeros": [((0, 0, 0), 90), ((0.01, 0, 0), 8)],
+    "a place beside a double point": [((2, 2, 2), 8), ((2.01, 2, 2), 2)],
+    "a place, and a double point elsewhere": [((2, 2, 2), 8), ((-2, 2, 2), 2)],
+    "places on a line": [((2, y, 2), 6) for y in np.linspace(-2, 2, 9)],
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_placeholders_are_the_places_that_many_more_rows_share_than_any_near_one(name):
+    rng = np.random.default_rng(0)
+    shared = [np.broadcast_to(place, (count, 3)) for place, count in PLACES[name]]
+    walls = rng.uniform(-3, 3, (400, 3))
+    walls[:, 0] = 2 * np.sign(walls[:, 0])
+    points = rng.permutation(np.concatenate([walls, *shared]).astype(np.float32))
+    places, position, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    nearest = np.argsort(np.linalg.norm(places[:, None] - places, axis=2), axis=1)[:, 1:9]
+    many = (counts > 5) & (counts > 5 * counts[nearest].max(axis=1))
+    zero = (points == 0).all(axis=1)
+    measured = np.where(zero, np.cumsum(zero) == 1, ~many[position.ravel()])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        np.testing.assert_array_equal(preprocess(points, None).points, points[measured])
+
+
 @pytest.mark.parametrize(("count", "distance"), [(25, 50), (25, 300), (250, 300)])
 def test_far_surfaces_are_kept_and_far_points_are_not(count, distance):
     """Of a room of 4 m; a window shows a facade a third as wide as it is far."""

@@ -106,7 +106,8 @@ def upper_median(values: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*b
 def equal_rows(points: Float[np.ndarray, "N D"], most: int) -> Int[np.ndarray, "N"] | None:
     """The number of each point's position, if more than `most` finite points share one; None otherwise."""
     # The sort of a hash takes a twentieth of the time of a k-d tree. The sum turns −0 into 0, whose bits differ. The
-    # lower bits of coordinates that were float32 are zero, so that the upper ones are mixed into them.
+    # lower bits of coordinates that were float32 are zero, so that the upper ones are mixed into them. Of a billion
+    # clouds of 100,000 points, less than one has two positions with one hash, whose numbers might then be several.
     columns = np.ascontiguousarray(points.T, np.float64) + 0.0
     keys = np.zeros(len(points), np.uint64)
     for column in columns.view(np.uint64):
