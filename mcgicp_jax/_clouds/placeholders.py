@@ -36,7 +36,7 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
     if complete is None and not (np.abs(points) <= LARGEST).all():
         finite = np.logical_and.reduce([finite, *(np.abs(column) <= LARGEST for column in points.T)])
     rows = np.flatnonzero(finite)
-    points = points if rows.size == len(points) else points[rows]
+    points = points if rows.size == len(points) else points.take(rows, axis=0)
     # Along columns NumPy reduces several times as fast.
     columns = np.ascontiguousarray(points.T, np.float64)
     zeros = np.flatnonzero(~columns.any(axis=0))
@@ -44,20 +44,20 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
     left_out[zeros[1:]] = True
     # Further zeros, which are frequent, take no part in the numbering of positions, which is slow.
     others = np.flatnonzero(~left_out)
-    positions = equal_rows((columns[:, others] if zeros.size > 1 else columns).T, _MANY)
-    if (positions is None and zeros.size <= 1) or (points[:1] == points).all():
+    positions = equal_rows((columns.take(others, axis=1) if zeros.size > 1 else columns).T, _MANY)
+    if (positions is None and zeros.size <= 1) or (columns[:, :1] == columns).all():
         # Points that are all at one place stay.
         return _without_far(columns, rows, finite)
     if positions is not None:
         counts = np.bincount(positions)
-        places = np.empty((len(counts), 3))
-        places[positions] = columns[:, others].T
-        zero = np.flatnonzero(~places.any(axis=1))
-        counts[zero] = max(zeros.size, 1)
+        zero = positions[np.searchsorted(others, zeros[:1])]
+        counts[zero] = zeros.size
         many = np.flatnonzero(counts > _MANY)
-        # At any position; no tree is needed if these are few.
-        around = np.partition(counts, -2)[-2]
+        # At any other position; no tree is needed if these are few.
+        around = np.delete(counts, counts.argmax()).max()
         if many.size > 1 or counts.max() <= _MANY * around:
+            places = np.empty((len(counts), 3))
+            places[positions] = columns.take(others, axis=1).T
             search = KDTreeSearch(workers=1)
             _, near = search.query(search.build(places), places[many], min(1 + _NEAR, len(places)), np.inf)
             # The nearest is the position itself.
@@ -68,7 +68,7 @@ def measured_rows(cloud: PointCloud, complete: Bool[np.ndarray, "N"] | None = No
         left_out[others] = repeated[positions]
     measured = finite.copy()
     measured[rows[left_out]] = False
-    return _without_far(columns[:, ~left_out], rows[~left_out], measured)
+    return _without_far(columns.compress(~left_out, axis=1), rows[~left_out], measured)
 
 
 def _without_far(
@@ -79,7 +79,7 @@ def _without_far(
         return measured
     stride = 1 + rows.size // _SAMPLE
     columns = columns - upper_median(columns[:, ::stride])[:, None]
-    distance = np.sqrt((columns * columns).sum(axis=0))
+    distance = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     limit = _FAR * upper_median(distance[::stride])
     far = np.flatnonzero(distance > limit)
     if not far.size or limit == 0:

@@ -240,7 +240,7 @@ def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | No
     keep = measured_rows(cloud, finite) if measured is None or not finite.all() else measured
     if len(keep) >= MIN_POINTS and keep.all():
         return cloud
-    others = np.sum(~finite & (np.abs(points) <= LARGEST).all(axis=1))
+    others = np.sum((np.abs(points[~finite]) <= LARGEST).all(axis=1))
     advice = f", {others} of them with finite coordinates; mark missing channels by channel_valid" if others else ""
     placeholders = finite & ~keep
     if keep.sum() < MIN_POINTS:

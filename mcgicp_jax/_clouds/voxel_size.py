@@ -290,4 +290,4 @@ def _finite_points(cloud: PointCloud) -> tuple[Float[np.ndarray, "N 3"], Bool[np
     """The finite points without placeholders, float64, and which rows they are."""
     cloud = primal(cloud)
     points, measured = np.asarray(cloud.points, np.float64), measured_rows(cloud)
-    return points if measured.all() else points[measured], measured
+    return points if measured.all() else points.compress(measured, axis=0), measured
