@@ -66,9 +66,32 @@ def test_scan_lines_that_match_themselves_do_not_hold_the_initial_pose(data):
 def test_a_pose_is_unverified_if_another_one_explains_the_surfaces_as_well():
     """A sparse room, 1 m off, where the surfaces coincide as well as at the truth, where the pose begins."""
     pair = office(9, 1000)
-    with pytest.warns(UserWarning, match=r"to poses \S+ m apart, at which surfaces coincide about as well"):
+    with pytest.warns(UserWarning, match=r" m away from it, at which surfaces coincide about as well; if the initial"):
         result = mcg.register(pair.source, pair.target, GICP)
     assert error(result) > 0.5 and result.status is Status.UNVERIFIED
+
+
+def corridor(count, low, high, seed):
+    """Points on floor, walls and ceiling of a corridor along x, 2 m wide and 2.5 m high, between two x."""
+    rng = np.random.default_rng(seed)
+    around, x = rng.uniform(0, 9, count), rng.uniform(low, high, count)
+    y = np.interp(around, [0, 2, 4.5, 6.5, 9], [0, 2, 2, 0, 0])
+    z = np.interp(around, [0, 2, 4.5, 6.5, 9], [0, 0, 2.5, 2.5, 0])
+    return np.stack([x, y, z], axis=1) + 0.01 * rng.normal(size=(count, 3))
+
+
+@pytest.mark.parametrize(("count", "seed"), [(1000, 1), (1500, 4)])
+def test_a_degenerate_pose_keeps_its_initial_value(count, seed):
+    """In the coarse phase the ends of the parts constrain the direction along the corridor."""
+    result = mcg.register(corridor(count, 5, 16, 2 * seed + 1), corridor(count, 0, 11, 2 * seed), GICP)
+    assert result.status is Status.DEGENERATE and error(result) < 0.1
+
+
+@pytest.mark.parametrize(("count", "seed"), [(300, 1), (600, 0)])
+def test_a_pose_far_from_the_initial_one_is_unverified_if_surfaces_coincide_near_it(count, seed):
+    with pytest.warns(UserWarning, match=r"4\.\d m away from it, at which surfaces coincide about as well"):
+        result = mcg.register(corridor(count, 5, 16, 2 * seed + 1), corridor(count, 0, 11, 2 * seed), GICP)
+    assert result.status is Status.UNVERIFIED
 
 
 def test_a_wrong_initial_pose_is_left():

@@ -59,6 +59,7 @@ from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
     BETTER,
     CLOSE,
+    GOOD_FIT,
     LITTLE_IN_COMMON,
     distance_moved,
     doubt_of_start,
@@ -234,7 +235,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         _warn_of_near_points(run)
     elif not measures and status == Status.CONVERGED and doubt:
         state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
-        doubt = f"{doubt}: the pose is UNVERIFIED; if the clouds show the same place, try a better initial pose"
+        doubt = f"the pose is UNVERIFIED: {doubt}"
         run = run._replace(loop=run.loop._replace(state=state), state=lambda: state, doubt=doubt)
     return run
 
@@ -361,27 +362,44 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
     if doubt is None:
         return run, ""
     # All are measured within the same distance.
-    runs, fits = [run], [doubt.fit]
-    for fraction in (1.0, CLOSE) if doubt.few and not doubt.little else (1.0,):
-        other = closely(fraction * float(settings.fine_distance))
+    fine = float(settings.fine_distance)
+    runs, fits, moved = [run], [doubt.fit], [doubt.moved]
+    distances = [f"({float(settings.max_distance):.2g}, {fine:.2g})"]
+    for distance in (fine, CLOSE * fine) if doubt.few and not doubt.little else (fine,):
+        other = closely(distance)
         if other.loop.state.status in USABLE:
             runs.append(other)
             fits.append(surface_fit(run.inputs, executor, other.loop))
+            moved.append(distance_moved(start, other.loop.state))
+            distances.append(f"{distance:.2g}")
     best = 0
     for i, fit in enumerate(fits):
         best = i if fit.exceeds(fits[best], BETTER) else best
+
+    def is_nearer(i: int) -> bool:
+        """Whether surfaces coincide at a pose nearer to the initial one, and channels do not tell it from the best."""
+        directions = cast(Directions, runs[best].loop.state.directions)
+        by_shape = doubt.few and not np.any(directions.constrained_by_channels)
+        return by_shape and moved[i] < moved[best] - fine and bool(fits[i].fit > GOOD_FIT)
+
+    # Along what nothing constrains, the pose keeps its initial value.
+    if runs[best].loop.state.status == Status.DEGENERATE:
+        best = next(filter(is_nearer, range(len(runs))), best)
     margin = 1 / BETTER if doubt.few else 1.0
-    rivals = [run for run, fit in zip(runs, fits, strict=True) if doubt.little or fit.exceeds(fits[best], margin)]
-    apart = max((distance_moved(runs[best].loop.state.pose, rival.loop.state) for rival in rivals), default=0.0)
+    rivals = [i for i, fit in enumerate(fits) if doubt.little or fit.exceeds(fits[best], margin) or is_nearer(i)]
+    apart = {i: distance_moved(runs[best].loop.state.pose, runs[i].loop.state) for i in rivals}
+    rival = max(rivals, key=apart.__getitem__, default=best)
     common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
     reason = ""
     if doubt.little and len(runs) == 1:
-        reason = f"{common}registration with a smaller max_distance fails"
-    elif apart > settings.fine_distance:
+        reason = f"{common}registration with a smaller max_distance fails; try a better initial pose"
+    elif apart.get(rival, 0.0) > fine:
         reason = (
-            f"{common}different values of max_distance lead from the same initial pose to poses {apart:.2g} m apart"
+            f"{common}max_distance={distances[best]} leads to this pose, {moved[best]:.2g} m from the initial one, and "
+            f"{distances[rival]} to one {apart[rival]:.2g} m away from it"
         )
         reason += "" if doubt.little else ", at which surfaces coincide about as well"
+        reason += f"; if the initial pose is good to {fine:.2g} m, pass max_distance={distances[-1]}, else a better one"
     return runs[best], reason
 
 
