@@ -48,12 +48,12 @@ class Deferred:
 
 # `isinstance` without a Python function: the first is asked of every node of a tree, the second of every array.
 is_deferred: Callable[[object], bool] = Deferred.__instancecheck__
-_is_tracer: Callable[[object], bool] = jax.core.Tracer.__instancecheck__
+is_tracer: Callable[[object], bool] = jax.core.Tracer.__instancecheck__
 
 
 def is_concrete(*trees: object) -> bool:
     """Whether every array in the trees is concrete, that is, none is a tracer of a JAX transformation."""
-    return not any(map(_is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
+    return not any(map(is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
 
 
 # The state of JAX's transformations inside the context below; None outside of it.
@@ -67,15 +67,13 @@ def outside_trace() -> Iterator[None]:
     if _outside.get() == get_opaque_trace_state():
         yield
         return
-    with on_cpu():
-        # Only inside a trace, since `jax.ensure_compile_time_eval` evaluates operation by operation.
-        staged = isinstance(_zero(), jax.core.Tracer)
-        with jax.ensure_compile_time_eval() if staged else contextlib.nullcontext():
-            before = _outside.set(get_opaque_trace_state())
-            try:
-                yield
-            finally:
-                _outside.reset(before)
+    # The second context only inside a trace, since it evaluates operation by operation.
+    with on_cpu(), jax.ensure_compile_time_eval() if is_tracer(_zero()) else contextlib.nullcontext():
+        before = _outside.set(get_opaque_trace_state())
+        try:
+            yield
+        finally:
+            _outside.reset(before)
 
 
 @jax.jit
@@ -91,7 +89,8 @@ def canonical_float() -> Any:
 
 def numpy_for(*trees: object) -> ModuleType:
     """NumPy if every array is concrete, so that nothing is compiled; `jax.numpy` if one is traced."""
-    return np if is_concrete(*trees) else jnp
+    # `is_concrete` written out: most formulas ask this.
+    return jnp if any(map(is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred))) else np
 
 
 def constant(tree: Any) -> Any:

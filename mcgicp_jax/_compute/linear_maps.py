@@ -17,7 +17,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete, is_deferred
+from mcgicp_jax._compute.concrete import AnyArray, is_concrete, is_deferred, is_tracer
 from mcgicp_jax._compute.threads import in_new_thread, side_by_side, with_settings_of_package
 
 
@@ -75,14 +75,14 @@ class SideBySide(AbstractLinearMap):
 
 def primal(tree: Any) -> Any:
     """The tree with NumPy values in place of tracers of `grad` and `jvp`. Tracers of `jit` and `vmap` remain."""
-
-    def value(leaf: Any) -> Any:
-        if is_concrete(leaf):
-            return leaf
-        fixed = jax.lax.stop_gradient(leaf)
-        return np.asarray(fixed) if is_concrete(fixed) else leaf
-
-    return tree if is_concrete(tree) else jax.tree.map(value, tree, is_leaf=is_deferred)
+    leaves, structure = jax.tree.flatten(tree, is_leaf=is_deferred)
+    if not any(map(is_tracer, leaves)):
+        return tree
+    for i, leaf in enumerate(leaves):
+        if is_tracer(leaf):
+            fixed = jax.lax.stop_gradient(leaf)
+            leaves[i] = leaf if is_tracer(fixed) else np.asarray(fixed)
+    return jax.tree.unflatten(structure, leaves)
 
 
 def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inputs: Sequence[Any]) -> list[jax.Array]:
@@ -235,10 +235,8 @@ mlir.register_lowering(_linear, _not_compiled)
 def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
     """The arrays of a tree, which depend on `inputs`, but have no derivative by them: reverse mode raises
     `NotImplementedError` with the message where it would use it, and forward mode gives NaN."""
-    if is_concrete(inputs):
-        return tree
     leaves = jax.tree.leaves(inputs, is_leaf=is_deferred)
-    tracers = [leaf for leaf in leaves if not is_concrete(leaf) and _is_float(leaf)]
+    tracers = [leaf for leaf in leaves if is_tracer(leaf) and _is_float(leaf)]
     if not tracers:
         return tree
 

@@ -80,10 +80,11 @@ def _known(options: tuple[tuple[str, bool | int], ...]) -> dict[str, bool | int]
 _SMALLEST_CLASS = 128
 
 
-def size_class(count: int, smallest: int = _SMALLEST_CLASS) -> int:
-    """The smallest of 128, 192, 256, 384, 512, ... that is at least `count`; or from another power of two on."""
-    power = max(smallest, 1 << (count - 1).bit_length())
-    return 3 * power // 4 if max(count, smallest) <= 3 * power // 4 else power
+def size_class(count: int) -> int:
+    """The smallest of 128, 192, 256, 384, 512, ... that is at least `count`."""
+    count = max(count, _SMALLEST_CLASS)
+    power = 1 << (count - 1).bit_length()
+    return 3 * power // 4 if count <= 3 * power // 4 else power
 
 
 # Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB.

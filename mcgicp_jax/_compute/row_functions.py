@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csc_array
 
-from mcgicp_jax._compute.concrete import Deferred, is_concrete, outside_trace
+from mcgicp_jax._compute.concrete import is_concrete, is_tracer, outside_trace
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Layout, Packed, RowsOnDemand, blocks
@@ -88,15 +88,14 @@ class GivenTable:
         return tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
 
     def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Any = None) -> None:
-        start = 0
-        for leaf in (self._leaves[i] for i in self.columns(moving)):
-            stop = start + math.prod(leaf.shape[1:])
-            found = cotangents[..., start:stop].swapaxes(0, 1).astype(np.float64)
-            into[id(leaf)] = into.get(id(leaf), 0) + found.reshape(len(found), *leaf.shape)
-            start = stop
+        leaves = [self._leaves[i] for i in self.columns(moving)]
+        ends = np.cumsum([math.prod(leaf.shape[1:]) for leaf in leaves])
+        for leaf, part in zip(leaves, np.split(cotangents, ends[:-1], axis=-1), strict=True):
+            slope = part.swapaxes(0, 1).astype(np.float64)
+            into[id(leaf)] = into.get(id(leaf), 0) + slope.reshape(len(slope), *leaf.shape)
 
-    def jvp(self, tangents: Slopes, moving: Moving, rows: Any) -> np.ndarray:
-        leaves = [tangents[id(self._leaves[i])] for i in self.columns(moving)]
+    def jvp(self, tangents: Slopes, rows: Any) -> np.ndarray:
+        leaves = [tangents[id(self._leaves[i])] for i in self.columns(frozenset(tangents))]
         return np.concatenate([leaf.reshape(*leaf.shape[:2], -1) for leaf in leaves], axis=-1).swapaxes(0, 1)[rows]
 
 
@@ -110,7 +109,8 @@ class RowFunction:
     def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, total: bool = False):
         self._function, self.size, self._total = function, size, total
         self._inputs = [
-            each if isinstance(each.table, Table) else each._replace(table=GivenTable(each.table)) for each in inputs
+            entry if isinstance(entry.table, Table) else entry._replace(table=GivenTable(entry.table))
+            for entry in inputs
         ]
         self._leaves = jax.tree.leaves(numbers)
         self._numbers = primal(numbers)
@@ -125,24 +125,23 @@ class RowFunction:
     @cached_property
     def arrays(self) -> dict[int, Any]:
         """The numbers, and the arrays on which the tables depend, by identity."""
-        found = {id(leaf): leaf for leaf in self._leaves}
-        for each in self._inputs:
-            found |= each.table.arrays
-        return found
+        arrays = {id(leaf): leaf for leaf in self._leaves}
+        for entry in self._inputs:
+            arrays |= entry.table.arrays
+        return arrays
 
-    @property
+    @cached_property
     def tracers(self) -> list[Any]:
-        return [array for array in self.arrays.values() if not is_concrete(array)]
+        return [array for array in self.arrays.values() if is_tracer(array)]
 
     def rows(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
-        found = self._over_blocks(rows, num_threads)
-        layouts = [part.layout for part in found[0][1]]
-        size = found[-1][0].stop
-        tables = [np.empty((size, *part.table.shape[1:]), part.table.dtype) for part in found[0][1]]
-        for places, parts in found:
+        results = self._over_blocks(rows, num_threads)
+        size, first = results[-1][0].stop, results[0][1]
+        tables = [np.empty((size, *part.table.shape[1:]), part.table.dtype) for part in first]
+        for places, parts in results:
             for table, part in zip(tables, parts, strict=True):
                 table[places] = np.asarray(part.table)[: places.stop - places.start]
-        return tuple(map(Packed, tables, layouts))
+        return tuple(map(Packed, tables, [part.layout for part in first]))
 
     def sums(self, num_threads: int | None = 1, packed: bool = True) -> list[Any]:
         """The sum over each block. Programs may not have ended."""
@@ -150,20 +149,22 @@ class RowFunction:
 
     @with_settings_of_package
     def _over_blocks(self, rows: Any, num_threads: int | None, packed: bool = True) -> list[tuple[slice, Any]]:
-        gathered = _Gathered(self._inputs, self.size, rows, num_threads)
-        run = _program(self._function, self._total, packed)
+        gathered = _Gathered(self._inputs, self.size, self._total, rows, num_threads)
+        program = _program(self._function, self._total, packed)
+
+        def run(places: slice, index: Any) -> tuple[slice, Any]:
+            return places, program(self._numbers, *gathered.block(index))
+
         # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
         with outside_trace():
-            return list(
-                self._in_order(gathered, lambda block, _: run(self._numbers, *block), gathered.size, num_threads)
-            )
+            return side_by_side([partial(run, *block) for block in gathered.blocks], num_threads)
 
     def value_and_jacobian(self, wanted: Sequence[int]) -> tuple[np.ndarray, list[np.ndarray]]:
         """A sum, packed, and its derivative (L, ...) by the leaves of `numbers` with these numbers; float64."""
         program = _jacobian_program(self._function, (tuple(wanted), *(() for _ in self._inputs)))
-        gathered = _Gathered(self._inputs, self.size, None)
-        results = self._in_order(gathered, lambda block, _: program(self._numbers, *block), num_cores())
-        parts = [jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), part) for _, part in results]
+        gathered = _Gathered(self._inputs, self.size, self._total)
+        results = gathered.in_order(lambda _, index: program(self._numbers, *gathered.block(index)))
+        parts = [jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), part) for part in results]
         return reduce(partial(jax.tree.map, np.add), parts)
 
     def cotangents(self, cotangents: np.ndarray, leaves: Sequence[Any]) -> list[np.ndarray]:
@@ -183,19 +184,20 @@ class RowFunction:
         numbers, *columns = chosen = self._chosen(moving)
         if not any(chosen):
             return
-        gathered = _Gathered(self._inputs, self.size, rows)
+        gathered = _Gathered(self._inputs, self.size, self._total, rows)
         program, count = _vjp_program(self._function, self._total, chosen), cotangents.shape[0 if self._total else 1]
 
-        def call(block: Any, places: slice) -> Any:
-            some = cotangents
+        def run(places: slice, index: Any) -> Any:
+            packs, indices = gathered.block(index)
+            of_block = cotangents
             if not self._total:
-                here = cotangents[places if rows is None else rows[places]]
-                some = np.zeros((gathered.block_size, *here.shape[1:]), here.dtype)
-                some[: len(here)] = here
-            return jax.tree.map(np.asarray, program(self._numbers, *block, some)), block[1]
+                of_rows = cotangents[places if rows is None else rows[places]]
+                of_block = np.zeros((gathered.block_size, *of_rows.shape[1:]), of_rows.dtype)
+                of_block[: len(of_rows)] = of_rows
+            return places, indices, *jax.tree.map(np.asarray, program(self._numbers, packs, indices, of_block))
 
         slopes: dict[int, np.ndarray] = {}
-        for places, ((by_numbers, by_rows), indices) in self._in_order(gathered, call, num_cores()):
+        for places, indices, by_numbers, by_rows in gathered.in_order(run):
             for i, by in zip(numbers, by_numbers, strict=True):
                 key = id(self._leaves[i])
                 into[key] = into.get(key, 0) + by.astype(np.float64)
@@ -208,70 +210,53 @@ class RowFunction:
         for j, slope in slopes.items():
             self._inputs[j].table.vjp(slope, moving, into, gathered.used(j))
 
-    def jvp(self, tangents: Slopes, moving: Moving, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
-        """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of what is moving. A scalar
-        0 if it does not depend on that."""
-        numbers, *columns = chosen = self._chosen(moving)
+    def jvp(self, tangents: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
+        """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of arrays. A scalar 0 if it
+        depends on none of them."""
+        numbers, *columns = chosen = self._chosen(frozenset(tangents))
         if not any(chosen):
             return np.zeros(())
-        gathered = _Gathered(self._inputs, self.size, rows)
+        gathered = _Gathered(self._inputs, self.size, self._total, rows)
         program = _jvp_program(self._function, self._total, chosen)
         by_numbers = [tangents[id(self._leaves[i])].astype(np.result_type(self._leaves[i])) for i in numbers]
         slopes: dict[int, np.ndarray] = {}
-        for j, table in ((j, self._inputs[j].table) for j, some in enumerate(columns) if some):
+        for j, table in ((j, self._inputs[j].table) for j, places in enumerate(columns) if places):
             used = gathered.used(j)
-            found = table.jvp(tangents, moving, used)
-            slopes[j] = np.zeros((table.size, *found.shape[1:]), found.dtype)
-            slopes[j][used] = found
+            of_used = table.jvp(tangents, used)
+            slopes[j] = np.zeros((table.size, *of_used.shape[1:]), of_used.dtype)
+            slopes[j][used] = of_used
 
-        def call(block: Any, _: slice) -> Any:
+        def run(places: slice, index: Any) -> np.ndarray:
+            packs, indices = gathered.block(index)
             by_rows = [
                 np.moveaxis(slopes[j][np.maximum(index, 0)], -2, 0).astype(pack.table.dtype) if j in slopes else None
-                for j, (pack, index) in enumerate(zip(*block, strict=True))
+                for j, (pack, index) in enumerate(zip(packs, indices, strict=True))
             ]
-            return np.asarray(program(self._numbers, *block, by_numbers, by_rows))
+            result = np.asarray(program(self._numbers, packs, indices, by_numbers, by_rows))
+            return result.astype(np.float64) if self._total else result[:, : places.stop - places.start]
 
-        parts = list(self._in_order(gathered, call, num_cores()))
-        if self._total:
-            return np.sum([part.astype(np.float64) for _, part in parts], axis=0)
-        return np.concatenate([part[:, : places.stop - places.start] for places, part in parts], axis=1).swapaxes(0, 1)
+        results = list(gathered.in_order(run))
+        return np.sum(results, axis=0) if self._total else np.concatenate(results, axis=1).swapaxes(0, 1)
 
     def _chosen(self, moving: Moving) -> Chosen:
         """The places of the numbers, and of the columns of each input, that depend on the moving arrays."""
         numbers = tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
-        return numbers, *(() if each.part else each.table.columns(moving) for each in self._inputs)
-
-    def _in_order(
-        self, gathered: _Gathered, call: Callable[[Any, slice], Any], at_once: int, num_threads: int | None = None
-    ) -> Iterator[tuple[slice, Any]]:
-        """Results for blocks, in order; only some are computed at once, which bounds the memory."""
-        cut = blocks(gathered.size, gathered.block_size)
-
-        def work(places: slice, index: Any) -> Any:
-            return call(gathered.block(index, self._total), places)
-
-        for start in range(0, len(cut), at_once):
-            some = cut[start : start + at_once]
-            results = side_by_side([partial(work, *each) for each in some], num_threads)
-            yield from zip((places for places, _ in some), results, strict=True)
+        return numbers, *(() if entry.part else entry.table.columns(moving) for entry in self._inputs)
 
 
 class ComputedTable(RowFunction):
     """The result of a row function, whose rows are computed when they are first used. Threads may share it.
 
     Trees after the first are constants to autodiff; tangents and cotangents are those of the `columns` that move alone.
-    `values` is a table with the same values, from which rows are taken.
+    `values` is a table with the same values, from which rows are taken. `computed` gives the packed trees, in which
+    some rows (None: all) are computed, and others may not be.
     """
 
     def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, values: Any = None):
         super().__init__(function, numbers, inputs, size)
-        # Not `self.rows`, whose cycle would keep the table until garbage is collected.
-        computed = RowFunction(function, numbers, self._inputs, size)
-        self._rows = RowsOnDemand(computed.rows, size) if values is None else values._rows
-
-    def computed(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
-        """The packed trees, in which these rows (None: all) are computed, and others may not be."""
-        return self._rows.computed(rows, num_threads)
+        # Of a copy: the cycle of `self.rows` would keep the table until garbage is collected.
+        table = RowsOnDemand(copy.copy(self).rows, size)
+        self.computed = table.computed if values is None else values.computed
 
     def trees(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Any, ...]:
         """The trees: of all rows, views that must not be changed, or copies of some rows."""
@@ -292,41 +277,48 @@ Table = GivenTable | ComputedTable
 class _Gathered:
     """The inputs of a row function for some rows (None: all), from which blocks are gathered."""
 
-    def __init__(self, inputs: Sequence[Input], size: int, rows: Any, num_threads: int | None = 1):
-        self.size = size if rows is None else len(rows)
-        self._rows = rows
-        self.indices, self._packs = [], []
+    def __init__(self, inputs: Sequence[Input], size: int, total: bool, rows: Any = None, num_threads: int | None = 1):
+        self._total, self._whole = total, rows is None
+        self._rows = np.arange(size, dtype=np.int32) if rows is None else rows
+        self.size, self.block_size = len(self._rows), BLOCK
+        self._indices, self._packs = [], []
         for table, index, part in inputs:
-            # Of all rows at once: neighbours are found on the way.
-            chosen = None if index is None else np.asarray(index[slice(None) if rows is None else rows], np.int32)
-            used = rows if chosen is None else np.maximum(chosen, 0).reshape(-1)
+            used = rows
+            if index is not None:
+                # Of all rows at once: neighbours are found on the way.
+                index = np.asarray(index[slice(None) if rows is None else rows], np.int32)
+                used = np.maximum(index, 0).reshape(-1)
+                if index.ndim == 2 and index.shape[1] > 1:
+                    self.block_size = NEIGHBORHOOD_BLOCK
             self._packs.append(table.computed(used, num_threads)[part])
-            self.indices.append(chosen)
-        wide = any(index is not None and index.ndim == 2 and index.shape[1] > 1 for index in self.indices)
-        self.block_size = NEIGHBORHOOD_BLOCK if wide else BLOCK
+            self._indices.append(index)
+        self.blocks = blocks(self.size, self.block_size)
 
-    def block(self, index: Any, total: bool) -> tuple[tuple[Packed, ...], tuple[Any, ...]]:
-        """The rows of a block (see `blocks`) and their numbers; −1 for padding if it must not add to a sum."""
-        own = index if self._rows is None else self._rows[index]
+    def block(self, rows: Any) -> tuple[tuple[Packed, ...], tuple[Any, ...]]:
+        """The rows of a block (see `blocks`) and their numbers; −1 for padding, which must not add to a sum."""
         packs, numbers = [], []
-        for pack, chosen in zip(self._packs, self.indices, strict=True):
-            if chosen is None:
-                packs.append(pack.rows(own))
-                number = np.arange(own.start, own.stop, dtype=np.int32) if isinstance(own, slice) else own
-                number = np.array(number, np.int32)
+        for pack, index in zip(self._packs, self._indices, strict=True):
+            if index is None:
+                packs.append(pack.rows(rows if self._whole else self._rows[rows]))
+                number = np.array(self._rows[rows], np.int32)
             else:
-                number = np.array(chosen[index].T, order="C")
+                number = np.array(index[rows].T, order="C")
                 packs.append(pack.rows(np.maximum(number, 0)))
-            if total and not isinstance(index, slice):
-                number[..., self.size - index[0] :] = -1
+            if self._total and not isinstance(rows, slice):
+                number[..., self.size - rows[0] :] = -1
             numbers.append(number)
         return tuple(packs), tuple(numbers)
 
+    def in_order(self, run: Callable[[slice, Any], Any]) -> Iterator[Any]:
+        """Results of `run` for each of the `blocks`; only some are computed at once, which bounds the memory."""
+        at_once = num_cores()
+        for start in range(0, len(self.blocks), at_once):
+            yield from side_by_side([partial(run, *block) for block in self.blocks[start : start + at_once]])
+
     def used(self, j: int) -> Int[np.ndarray, "n"]:
-        index = self.indices[j]
-        if index is None:
-            return np.arange(self.size) if self._rows is None else self._rows
-        return np.unique(index[index >= 0])
+        """The rows of the table of input `j` that are used."""
+        index = self._indices[j]
+        return self._rows if index is None else np.unique(index[index >= 0])
 
 
 @with_settings_of_package
@@ -360,10 +352,10 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
         rows = np.where(matches.valid, matches.indices, -1)
         blockwise(difference, 0.1, Input(source.channels), Input(target.channels, rows), total=True)
     """
-    if not all(isinstance(each, Input) for each in inputs):
-        kinds = ", ".join(type(each).__name__ for each in inputs)
+    if not all(isinstance(entry, Input) for entry in inputs):
+        kinds = ", ".join(type(entry).__name__ for entry in inputs)
         raise ValueError(f"inputs: expected each to be an Input, as Input(array, row_numbers), got {kinds}")
-    if not is_concrete(primal((numbers, [each for each in inputs if not isinstance(each.table, Table)]))):
+    if not is_concrete(primal((numbers, [entry for entry in inputs if not isinstance(entry.table, Table)]))):
         return over_whole(function, numbers, inputs, total)
     applied = RowFunction(function, numbers, inputs, size_of(inputs[0]), total)
     call = partial(applied.sums, None) if total else partial(applied.rows, None, None)
@@ -383,7 +375,7 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
     elif total:
         leaves = [jax.device_put(leaf) for leaf in leaves]
     first = jax.tree.unflatten(structure, leaves)
-    return first if total else (first, *(each.tree for each in packs[1:]))
+    return first if total else (first, *(part.tree for part in packs[1:]))
 
 
 def size_of(first: Input) -> int:
@@ -400,9 +392,8 @@ class _Derivative(AbstractLinearMap):
         self._leaves = applied.tracers
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        slopes = {id(self._leaves[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
-        found = self._applied.jvp(slopes, frozenset(slopes))
-        return jax.tree.leaves(Packed(found if self._total else found.swapaxes(0, 1), self._layout).tree)
+        results = self._applied.jvp({id(self._leaves[i]): by for i, by in zip(moving, tangents, strict=True)})
+        return jax.tree.leaves(Packed(results if self._total else results.swapaxes(0, 1), self._layout).tree)
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         packed = Packed.of(list(cotangents), num_axes=1 if self._total else 2).table
@@ -412,57 +403,51 @@ class _Derivative(AbstractLinearMap):
 
 def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input], total: bool = False) -> Any:
     """A row function of whole arrays, inside transformations; rows of many neighbourhoods are computed in blocks."""
-    numbers, inputs = jax.tree.map(jnp.asarray, numbers), [_found(each) for each in inputs]
+    numbers, inputs = jax.tree.map(jnp.asarray, (numbers, inputs))
     num_rows = size_of(inputs[0])
-    wide = any(each.index is not None and each.index.ndim == 2 for each in inputs)
+    wide = any(entry.index is not None and entry.index.ndim == 2 for entry in inputs)
     if total or not wide or num_rows <= _LARGEST_WHOLE:
-        return function(numbers, *(whole(each, spread=not total) for each in inputs))
+        return function(numbers, *(whole(entry, spread=not total) for entry in inputs))
     num_blocks = -(-num_rows // _LARGEST_BLOCK)
     size = -(-num_rows // num_blocks)
     padded = jnp.minimum(jnp.arange(num_blocks * size), num_rows - 1).reshape(num_blocks, size)
-    found = jax.lax.map(lambda rows: function(numbers, *(whole(each, rows, True) for each in inputs)), padded)
-    return jax.tree.map(lambda leaf: leaf.reshape(padded.size, *leaf.shape[2:])[:num_rows], found)
+    results = jax.lax.map(lambda rows: function(numbers, *(whole(entry, rows, True) for entry in inputs)), padded)
+    return jax.tree.map(lambda leaf: leaf.reshape(padded.size, *leaf.shape[2:])[:num_rows], results)
 
 
 def over_both(function: Callable[..., Any], numbers: Any, one: Sequence[Input], other: Sequence[Input]) -> Any:
     """`over_whole` for two clouds, in one compiled body if their inputs are alike and they are not large."""
-    one, other = [_found(each) for each in one], [_found(each) for each in other]
-    trees = [[each.table for each in inputs] for inputs in (one, other)]
+    one, other = jax.tree.map(jnp.asarray, (one, other))
+    trees = [[entry.table for entry in inputs] for inputs in (one, other)]
     sizes = [len(jax.tree.leaves(tree)[0]) for tree in trees]
     structures: list[Any] = [jax.tree.structure(tree) for tree in trees]
-    alike = structures[0] == structures[1]
-    if not alike or sum(sizes) > _LARGEST_WHOLE or one[0].index is not None:
+    if structures[0] != structures[1] or sum(sizes) > _LARGEST_WHOLE or one[0].index is not None:
         return over_whole(function, numbers, one), over_whole(function, numbers, other)
 
-    def stacked(each: Input, next_one: Input) -> Input:
-        table = jax.tree.map(lambda *rows: jnp.concatenate(list(map(jnp.asarray, rows))), each.table, next_one.table)
-        if each.index is None:
+    def stacked(entry: Input, next_one: Input) -> Input:
+        table = jax.tree.map(lambda *rows: jnp.concatenate(rows), entry.table, next_one.table)
+        if entry.index is None:
             return Input(table)
-        indices = [jnp.asarray(each.index), jnp.asarray(next_one.index)]
+        indices = [entry.index, jnp.where(next_one.index >= 0, next_one.index + sizes[0], -1)]
         most = max(index.shape[1] for index in indices)
-        indices[1] = jnp.where(indices[1] >= 0, indices[1] + sizes[0], -1)
         padded = [jnp.pad(index, [(0, 0), (0, most - index.shape[1])], constant_values=-1) for index in indices]
         return Input(table, jnp.concatenate(padded))
 
-    found = over_whole(function, numbers, list(map(stacked, one, other)))
-    return jax.tree.map(lambda rows: rows[: sizes[0]], found), jax.tree.map(lambda rows: rows[sizes[0] :], found)
+    both = over_whole(function, numbers, list(map(stacked, one, other)))
+    return jax.tree.map(lambda rows: rows[: sizes[0]], both), jax.tree.map(lambda rows: rows[sizes[0] :], both)
 
 
-def _found(given: Input) -> Input:
-    return given._replace(index=given.index.whole) if isinstance(given.index, Deferred) else given
-
-
-def whole(given: Input, rows: Any = None, spread: bool = False) -> Rows:
-    """All rows, or some, of a pytree of arrays, some of which are traced. Where there is none it is the first, or with
-    `spread` that of the same number: GPUs add the cotangents of a row, zeros included, one after the other."""
-    tree, index = jax.tree.map(jnp.asarray, given.table), given.index
+def whole(entry: Input, rows: Any = None, spread: bool = False) -> Rows:
+    """All rows, or some, of a pytree of arrays, some of which are traced. Missing ones (−1) read row 0; with `spread`,
+    different rows, because GPUs add the cotangents of one row, zeros included, one after the other."""
+    tree, index = jax.tree.map(jnp.asarray, (entry.table, entry.index))
     size = len(jax.tree.leaves(tree)[0])
     if index is None and rows is None:
         return Rows(tree, jnp.arange(size))
-    index = rows if index is None else jnp.asarray(index)[slice(None) if rows is None else rows].T
+    index = rows if index is None else index[slice(None) if rows is None else rows].T
     missing = (jnp.arange(index.shape[-1]) if rows is None else rows) % size if spread else 0
-    found = jnp.where(index < 0, missing, index)
-    return Rows(jax.tree.map(lambda array: array[found], tree), index)
+    read = jnp.where(index < 0, missing, index)
+    return Rows(jax.tree.map(lambda array: array[read], tree), index)
 
 
 def _add_rows(
@@ -481,12 +466,12 @@ def _program(function: Callable[..., Any], total: bool, packed: bool) -> Callabl
     """A row function for a block, packed: to pass dozens of arrays takes longer than to use them."""
 
     def program(numbers: Any, packs: Any, indices: Any) -> Any:
-        found = function(numbers, *(Rows(pack.tree, index) for pack, index in zip(packs, indices, strict=True)))
+        result = function(numbers, *(Rows(pack.tree, index) for pack, index in zip(packs, indices, strict=True)))
         if not packed:
-            return found
-        if not total and type(found) is not tuple:
+            return result
+        if not total and type(result) is not tuple:
             raise ValueError("function: expected a tuple of pytrees with one row each; with total=True, a sum")
-        return Packed.of(found, num_axes=0) if total else tuple(Packed.of(part) for part in found)
+        return Packed.of(result, num_axes=0) if total else tuple(map(Packed.of, result))
 
     program.__name__ = function.__name__
     return quickly_compiled(program)
@@ -505,8 +490,8 @@ def _of_chosen(
             for i, value in zip(places, values, strict=True):
                 leaves[i] = value
             replaced.append(jax.tree.unflatten(structure, leaves))
-        found = function(replaced[0], *map(Rows, replaced[1:], indices))
-        return Packed.of(found if total else found[0], num_axes=0 if total else 1).table
+        value = function(replaced[0], *map(Rows, replaced[1:], indices))
+        return Packed.of(value if total else value[0], num_axes=0 if total else 1).table
 
     return result, [[leaves[i] for i in places] for (leaves, _), places in zip(trees, chosen, strict=True)]
 
@@ -538,9 +523,9 @@ def _jvp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> C
         result, here = _of_chosen(function, total, chosen, numbers, packs, indices)
         slopes = [by_numbers]
         for columns, joined, index in zip(here[1:], by_rows, indices, strict=True):
-            ends = np.cumsum([math.prod(each.shape[index.ndim :]) for each in columns])
+            ends = np.cumsum([math.prod(column.shape[index.ndim :]) for column in columns])
             parts = jnp.split(joined, ends[:-1], axis=-1) if columns else []
-            slopes.append([part.reshape(len(part), *each.shape) for part, each in zip(parts, columns, strict=True)])
+            slopes.append([part.reshape(len(part), *leaf.shape) for part, leaf in zip(parts, columns, strict=True)])
         return jax.vmap(jax.linearize(result, here)[1])(slopes)
 
     program.__name__ = f"jvp_{function.__name__}"

@@ -37,8 +37,7 @@ class Packed(Generic[Tree]):
     """A tree of arrays in one; a pytree, whose layout is static.
 
     Attributes:
-        table: (..., L). Its dtype is that of the floats, if there are any; integers up to 2²⁴ and booleans are exact in
-            it.
+        table: (..., L), of the dtype of the floats, if there are any; integers up to 2²⁴ and booleans are exact in it.
     """
 
     table: Any
@@ -50,15 +49,13 @@ class Packed(Generic[Tree]):
         leaves, structure = jax.tree.flatten(tree)
         dtypes = [leaf.dtype for leaf in leaves]
         dtype = np.result_type(*([dtype for dtype in dtypes if jnp.issubdtype(dtype, jnp.floating)] or dtypes))
-        layout = Layout(
-            structure,
-            tuple(leaf.shape[num_axes:] for leaf in leaves),
-            tuple(None if own == dtype else own for own in dtypes),
-        )
         xp: Any = np if isinstance(leaves[0], np.ndarray) else jnp
-        shared = leaves[0].shape[:num_axes]
-        table = xp.concatenate([xp.asarray(leaf, dtype).reshape((*shared, -1)) for leaf in leaves], axis=-1)
-        return Packed(table, layout)
+        columns, shapes, others = [], [], []
+        for leaf in leaves:
+            columns.append(xp.asarray(leaf, dtype).reshape((*leaf.shape[:num_axes], -1)))
+            shapes.append(leaf.shape[num_axes:])
+            others.append(None if leaf.dtype == dtype else leaf.dtype)
+        return Packed(xp.concatenate(columns, axis=-1), Layout(structure, tuple(shapes), tuple(others)))
 
     @property
     def tree(self) -> Tree:
@@ -133,9 +130,9 @@ Block = tuple[slice, slice | Int[np.ndarray, "BLOCK"]]
 
 def blocks(num_rows: int, size: int = BLOCK) -> list[Block]:
     """For each block, its slice of rows, and an index of exactly `size` rows that repeats the last row as padding."""
-    whole = [slice(start, start + size) for start in range(0, num_rows - size + 1, size)]
-    cut: list[Block] = [(part, part) for part in whole]
-    start = len(whole) * size
-    if start < num_rows:
-        cut.append((slice(start, num_rows), np.minimum(np.arange(start, start + size), num_rows - 1)))
+    cut: list[Block] = []
+    for start in range(0, num_rows, size):
+        places = slice(start, min(start + size, num_rows))
+        padded = places.stop - start < size
+        cut.append((places, np.minimum(np.arange(start, start + size), num_rows - 1) if padded else places))
     return cut

@@ -113,7 +113,7 @@ class PoseDerivative(AbstractLinearMap):
         slopes = {id(self.arrays[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
         pose, inverse, _ = self._root
         count = len(tangents[0])
-        change = np.broadcast_to(self._score(pose).jvp(slopes, frozenset(slopes)), (count, 6))
+        change = np.broadcast_to(self._score(pose).jvp(slopes), (count, 6))
         if self._fusion is not None:
             by_score, by_form = self._by_balance(np.eye(6))
             change = change @ by_score.T
