@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._math.statistics import sampled_rows
 
 # Steps below this fraction of the spacing do no harm: in rooms of 5,000 points, errors are those without steps up to
@@ -35,7 +35,7 @@ _SHARE, _SAME, _SPREAD = 0.08, 0.4, 0.05
 def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[AnyArray, "3"]:
     """The step of the coordinates on each axis, metres; 0 below a third of the spacing. Steps of one or two axes count
     only if they are those of float32, or the cloud is no exact regular sample (height map, sections, profiles)."""
-    step, float32 = (cached_with_cloud(_steps) if is_concrete(cloud) else _steps)(cloud)
+    step, float32 = _steps(cloud)
     xp = numpy_for(step, spacing)
     coarse = step > _HARMFUL * spacing
     if xp is np and not coarse.any():
@@ -44,6 +44,7 @@ def harmful_steps(cloud: PointCloud, spacing: Float[AnyScalar, ""]) -> Float[Any
     return xp.where(coarse & counted, step, 0)
 
 
+@cached_with_cloud
 def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]]:
     """The step of the coordinates on each axis, metres (0: none), and whether it is the rounding of float32."""
     rows, counts = sampled_rows(cloud.valid)

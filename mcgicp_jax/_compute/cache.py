@@ -12,7 +12,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import jax
 import numpy as np
 
-from mcgicp_jax._compute.concrete import outside_trace
+from mcgicp_jax._compute.concrete import is_concrete, outside_trace
 from mcgicp_jax._compute.threads import with_settings_of_package
 
 Value = TypeVar("Value")
@@ -54,7 +54,7 @@ class Cache:
 
 
 class _CachedWithCloud:
-    """The cached values of one cloud; dropped when the cloud is collected."""
+    """The cached values of one cloud, by function; dropped when the cloud is collected."""
 
     def __init__(self, cloud: Any):
         self.num_rows = cloud.points.shape[0]
@@ -69,7 +69,8 @@ _clouds = Cache(MAX_ROWS, lambda cached: cached.num_rows)
 
 def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Parameters, Value]:
     """Decorator of functions whose first argument is a cloud. The key of a result is the cloud, by identity, and all
-    other arguments, pytrees that are compared by value: nothing that the result depends on can be missing in it.
+    other arguments, pytrees that are compared by value: nothing that the result depends on can be missing in it. With
+    traced arguments nothing is cached.
 
     Values live no longer than their cloud, any object with `points` that can be referenced weakly, unless they refer to
     it themselves.
@@ -77,13 +78,14 @@ def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Paramete
 
     @wraps(compute)
     def cached(*arguments: Parameters.args, **named: Parameters.kwargs) -> Value:
+        if not is_concrete(arguments, named):
+            return compute(*arguments, **named)
         cloud, *rest = arguments
         leaves, structure = jax.tree.flatten((rest, named))
         key = (structure, *map(_by_value, leaves))
-        with_cloud = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud))
-        if compute not in with_cloud.values:
-            with_cloud.values.setdefault(compute, Cache(_VALUES_PER_FUNCTION))
-        return with_cloud.values[compute].get(key, lambda: compute(*arguments, **named))
+        caches = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud)).values
+        cache = caches.get(compute) or caches.setdefault(compute, Cache(_VALUES_PER_FUNCTION))
+        return cache.get(key, partial(compute, *arguments, **named))
 
     return cached
 
@@ -108,15 +110,17 @@ class Lazy(Generic[Value]):
 
     @classmethod
     def of(cls, value: Value) -> Lazy[Value]:
-        return cls.tree_unflatten(None, (value,))
+        lazy = cls(lambda: value)
+        lazy._compute, lazy._value = None, value
+        return lazy
 
     @property
     def value(self) -> Value:
         with self._lock:
             if self._compute is not None:
                 with outside_trace():
-                    self._value = with_settings_of_package(self._compute)()
-                self._value = self._value if self._finish is None else self._finish(self._value)
+                    value = with_settings_of_package(self._compute)()
+                self._value = value if self._finish is None else self._finish(value)
                 # Frees the arrays that the closures hold.
                 self._compute = self._finish = None
         return self._value
@@ -126,9 +130,7 @@ class Lazy(Generic[Value]):
 
     @classmethod
     def tree_unflatten(cls, _: None, children: tuple[Value]) -> Lazy[Value]:
-        deferred = object.__new__(cls)
-        deferred._compute, deferred._finish, deferred._lock, deferred._value = None, None, threading.Lock(), children[0]
-        return deferred
+        return cls.of(children[0])
 
     def __reduce__(self) -> Any:
         return Lazy.of, (self.value,)

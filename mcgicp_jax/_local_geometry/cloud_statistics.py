@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, numpy_for
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
@@ -119,11 +119,8 @@ def grid_spacing(cloud: PointCloud) -> Float[AnyScalar, ""]:
     return _spacings(cloud)[1]
 
 
+@cached_with_cloud
 def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
-    return cached_with_cloud(_measured_spacings)(cloud) if is_concrete(cloud) else _measured_spacings(cloud)
-
-
-def _measured_spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     xp = numpy_for(cloud)
     rows, counts = sampled_rows(xp.asarray(cloud.valid))
     # (k, n): neighbours come first, so that NumPy's loops run over the points.

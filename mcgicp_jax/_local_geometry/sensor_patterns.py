@@ -102,11 +102,11 @@ def without_patterns(source: PointCloud, target: PointCloud) -> list[PointCloud]
                     f"channel {name}: {share:.0%} of its variance is a function of range, elevation or azimuth about "
                     "the origin; it seems to move with the sensor, and is left out"
                 )
-    # The cached copy is the same each time, with all that is cached of it.
-    blank = cached_with_cloud(_blank) if is_concrete(source, target, left_out) else _blank
-    return [blank(cloud, left_out) for cloud in (source, target)]
+    return [_blank(cloud, left_out) for cloud in (source, target)]
 
 
+# The cached copy is the same each time, with all that is cached of it.
+@cached_with_cloud
 def _blank(cloud: PointCloud, left_out: Bool[AnyArray, "C"]) -> PointCloud:
     return cloud.replace_rows(channels=numpy_for(cloud.channels, left_out).where(left_out, 0, cloud.channels))
 
@@ -115,8 +115,7 @@ def without_constant_part(cloud: PointCloud) -> PointCloud:
     """Mark a constant part, such as black outside of an image, as missing: its edge may move with the sensor."""
     if not cloud.channels.shape[1]:
         return cloud
-    fixed = primal(cloud)
-    part = cached_with_cloud(_constant_part)(fixed) if is_concrete(fixed) else _constant_part(fixed)
+    part = _constant_part(primal(cloud))
     if is_concrete(part):
         if not part.any():
             return cloud
@@ -125,9 +124,10 @@ def without_constant_part(cloud: PointCloud) -> PointCloud:
             f"channels {', '.join(names)}: {part.any(axis=1).sum()} of {len(part)} points lie together and have one "
             "value, as outside of an image; it counts as missing. Mark missing channels by channel_valid"
         )
-    return cached_with_cloud(_missing)(cloud, part) if is_concrete(cloud, part) else _missing(cloud, part)
+    return _missing(cloud, part)
 
 
+@cached_with_cloud
 def _constant_part(cloud: PointCloud) -> Bool[AnyArray, "N C"]:
     xp = numpy_for(cloud)
     channels, (rows, valid) = xp.asarray(cloud.channels), sampled_rows(xp.asarray(cloud.valid))
@@ -137,7 +137,7 @@ def _constant_part(cloud: PointCloud) -> Bool[AnyArray, "N C"]:
     part = channels == middle
     share = xp.sum(part[rows] & valid[:, None], axis=0) / xp.maximum(xp.sum(valid), 1)
     masks = cloud.replace_rows(channels=part.astype(channels.dtype))
-    constant_channels = (share > 0.5) & (share < 1) & (xp.maximum(*_explained(masks)) > _ONE_PART)
+    constant_channels = (share > 0.5) & (share < 1) & (xp.maximum(*explained(masks)) > _ONE_PART)
     together = (part | ~constant_channels).all(axis=1) & constant_channels.any()
     if cloud.deferred_neighbors is not None and (xp is not np or together.any()):
         # Voxels across the edge hold means of both sides.
@@ -146,19 +146,17 @@ def _constant_part(cloud: PointCloud) -> Bool[AnyArray, "N C"]:
     return constant_channels & together[:, None]
 
 
+@cached_with_cloud
 def _missing(cloud: PointCloud, part: Bool[AnyArray, "N C"]) -> PointCloud:
     present = ~part if cloud.channel_valid is None else cloud.channel_valid & ~part
     return cloud.replace_rows(channel_valid=present)
 
 
+@cached_with_cloud
 def explained(cloud: PointCloud) -> Explained:
-    return cached_with_cloud(_explained)(cloud) if is_concrete(cloud) else _explained(constant(cloud))
-
-
-def _explained(cloud: PointCloud) -> Explained:
     # Huge values overflow; comparisons with shares that are not finite are False.
     with np.errstate(all="ignore"):
-        sample = _sample(cloud)
+        sample = _sample(constant(cloud))
         return Explained(_by_angles(sample), _smooth(sample))
 
 
