@@ -15,12 +15,11 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mcgicp_jax._clouds.columns import COLORS, arrays_of
 from mcgicp_jax._clouds.depth_images import back_project
-from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.concrete import DeferredRows, is_concrete
 from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._compute.programs import size_class
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
-from mcgicp_jax._search.base import NeighborsOnDemand
 
 if TYPE_CHECKING:
     # Array input: NumPy, JAX or any array-like, or nested lists.
@@ -177,7 +176,7 @@ class PointCloud(eqx.Module):
     channels: Float[Array, "*batch N C"] | Float[np.ndarray, "*batch N C"]
     channel_valid: Bool[Array, "*batch N C"] | Bool[np.ndarray, "*batch N C"] | None
     valid: Bool[Array, "*batch N"] | Bool[np.ndarray, "*batch N"]
-    deferred_neighbors: Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | NeighborsOnDemand | None
+    deferred_neighbors: Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | DeferredRows | None
     covariances: Float[Array, "*batch N 3 3"] | Float[np.ndarray, "*batch N 3 3"] | None
     origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     voxels: Voxels
@@ -345,7 +344,7 @@ class PointCloud(eqx.Module):
         None for raw clouds. `preprocess` leaves the search to the first use of each row; reading this finds the rest.
         """
         neighbors = self.deferred_neighbors
-        return neighbors.whole if isinstance(neighbors, NeighborsOnDemand) else neighbors
+        return neighbors.whole if isinstance(neighbors, DeferredRows) else neighbors
 
     @property
     def voxel_size(self) -> float | None:

@@ -260,7 +260,7 @@ def _thinner(clouds: Sequence[_Averages], thickness: float, start: int) -> int |
 
 
 def _shape_of(columns: Float[np.ndarray, "3 N"], neighbors: Any = None) -> Shape:
-    """The shape of a sample of the neighbourhoods: of (N, k) rows or `NeighborsOnDemand`; searched if None."""
+    """The shape of a sample of the neighbourhoods: of (N, k) rows or `DeferredRows`; searched if None."""
     size = columns.shape[1]
     rows = np.random.default_rng(0).integers(0, size, _SAMPLE)
     if neighbors is None:

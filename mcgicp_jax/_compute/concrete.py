@@ -16,6 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from mcgicp_jax._compute.devices import on_cpu
+from mcgicp_jax._compute.tables import RowsOnDemand
 
 # NumPy arrays (outside transformations) or JAX arrays, and scalars of either kind.
 if TYPE_CHECKING:
@@ -26,14 +27,33 @@ else:
     AnyScalar = ArrayLike
 
 
-class Deferred:
-    """A concrete array that is computed when it is needed. As a pytree it is the whole array: what JAX passes through a
-    transformation, copies or pickles is computed first."""
+@jax.tree_util.register_pytree_node_class
+class DeferredRows:
+    """A concrete array, such as the neighbours of points, whose rows are computed when they are needed.
 
-    # Not an `abc.ABC`, for whose subclasses `isinstance` takes ten times as long: it is asked of every array.
+    As a pytree it is the whole array: what JAX passes through a transformation, copies or pickles is computed first.
+
+    Args:
+        compute: as of `RowsOnDemand`.
+        shape: of the array.
+        anew: makes the same object for pickles, so that a worker computes it; None: pickles hold the whole array.
+    """
+
+    def __init__(
+        self, compute: Callable[[Any, int | None], np.ndarray], shape: tuple[int, ...], anew: Callable[[], Any] | None
+    ):
+        self.shape, self._anew = shape, anew
+        self._table = RowsOnDemand(compute, shape[0])
+
+    def __getitem__(self, rows: Any) -> np.ndarray:
+        return self._table.computed(rows)[rows]
+
     @property
     def whole(self) -> np.ndarray:
-        raise NotImplementedError
+        """All rows, as a read-only array."""
+        rows = self._table.computed()
+        rows.setflags(write=False)
+        return rows
 
     def tree_flatten(self) -> tuple[tuple[np.ndarray], None]:
         return (self.whole,), None
@@ -43,11 +63,11 @@ class Deferred:
         return children[0]
 
     def __reduce__(self) -> Any:
-        return np.asarray, (self.whole,)
+        return (np.asarray, (self.whole,)) if self._anew is None or self._table.complete else (self._anew, ())
 
 
 # `isinstance` without a Python function: the first is asked of every node of a tree, the second of every array.
-is_deferred: Callable[[object], bool] = Deferred.__instancecheck__
+is_deferred: Callable[[object], bool] = DeferredRows.__instancecheck__
 is_tracer: Callable[[object], bool] = jax.core.Tracer.__instancecheck__
 
 

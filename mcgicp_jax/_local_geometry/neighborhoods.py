@@ -78,7 +78,7 @@ class Neighborhoods(NamedTuple):
 
 
 def check_neighbors(cloud: PointCloud, xp: ModuleType) -> Any:
-    """The (N, k) neighbours of a cloud, on the host perhaps `NeighborsOnDemand`; a raw cloud raises `ValueError`."""
+    """The (N, k) neighbours of a cloud, on the host perhaps `DeferredRows`; a raw cloud raises `ValueError`."""
     deferred = cloud.deferred_neighbors
     if deferred is None:
         raise ValueError(NO_NEIGHBORS)

@@ -12,8 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray, Deferred
-from mcgicp_jax._compute.tables import RowsOnDemand
+from mcgicp_jax._compute.concrete import AnyArray
 
 
 class SearchPoints(NamedTuple):
@@ -68,31 +67,6 @@ class Correspondences(eqx.Module):
 
     def __repr__(self) -> str:
         return f"Correspondences({self.indices.shape[-1]} source rows)"
-
-
-@jax.tree_util.register_pytree_node_class
-class NeighborsOnDemand(Deferred):
-    """The array of `AbstractSearch.neighbors`, whose rows `find` computes when they are needed (None: all). `anew`
-    makes the same object for pickles, so that a worker searches; None: pickles hold the whole array."""
-
-    def __init__(
-        self, find: Callable[[Any], Int[np.ndarray, "n k"]], shape: tuple[int, int], anew: Callable[[], Any] | None
-    ):
-        self.shape, self._anew = shape, anew
-        self._table = RowsOnDemand(lambda rows, _: find(rows), shape[0])
-
-    def __getitem__(self, rows: Any) -> Int[np.ndarray, "*n k"]:
-        return self._table.computed(rows)[rows]
-
-    @property
-    def whole(self) -> Int[np.ndarray, "N k"]:
-        """All rows, as a read-only array."""
-        rows = self._table.computed()
-        rows.setflags(write=False)
-        return rows
-
-    def __reduce__(self) -> Any:
-        return super().__reduce__() if self._anew is None or self._table.complete else (self._anew, ())
 
 
 class AbstractIndex(abc.ABC):
@@ -165,5 +139,5 @@ class AbstractSearch(eqx.Module):
         """
 
     def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Any:
-        """`neighbors`, as an array or as `NeighborsOnDemand`."""
+        """`neighbors`, as an array or as `DeferredRows`."""
         return self.neighbors(points, num_neighbors)

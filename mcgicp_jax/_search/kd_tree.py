@@ -7,13 +7,12 @@ from pose to pose, and the callback with its cache inside transformations. A sub
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import hashlib
 import importlib.util
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -24,11 +23,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
+from mcgicp_jax._compute.concrete import DeferredRows
 from mcgicp_jax._compute.programs import call_host
-from mcgicp_jax._search.base import IDENTITY, AbstractSearch, NeighborsOnDemand, SearchPoints, on_host, search_points
+from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints, on_host, search_points
 from mcgicp_jax._search.ties import TiedTree, TreeBackend
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
+# A tree of SciPy, or of pykdtree, which may not be installed.
+Tree: TypeAlias = Any
 # Where pykdtree is quicker than SciPy's tree, see Constants in `tests/benchmarks/README.md`. Up to seven dimensions the
 # distances of both agree to the last bit, since both add the squared differences in the same order.
 MAX_DIMENSIONS = 4
@@ -40,33 +42,13 @@ def has_pykdtree() -> bool:
     return all(importlib.util.find_spec(name) for name in ("pykdtree", "threadpoolctl"))
 
 
-class PyKDTree:
-    """A tree of pykdtree, which answers on the calling thread alone."""
-
-    def __init__(self, points: Float[np.ndarray, "M D"]):
-        from pykdtree.kdtree import KDTree
-
-        self.points = np.ascontiguousarray(points, np.float64)
-        with _one_thread():
-            self._tree = KDTree(self.points)
-
-    def query(
-        self, queries: Float[np.ndarray, "N D"], k: int, bound: float
-    ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        queries = np.ascontiguousarray(queries, np.float64)
-        with _one_thread():
-            distances, rows = self._tree.query(queries, k=k, distance_upper_bound=bound)
-        return distances.reshape(-1, k), rows.reshape(-1, k).astype(np.int64)
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """OpenMP with one thread: queries are divided among our own, and a forked process has no others."""
+def _by_one_thread(call: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Call with one thread of OpenMP: queries are divided among our own, and a forked process has no others."""
     before = [(library, library.get_num_threads()) for library in _openmp()]
     for library, _ in before:
         library.set_num_threads(1)
     try:
-        yield
+        return call(*arguments, **named)
     finally:
         for library, number in before:
             library.set_num_threads(number)
@@ -115,18 +97,13 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
         return self.neighbors_on_demand(points, num_neighbors).whole
 
-    def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> NeighborsOnDemand:
-        built: list[TiedTree] = []
+    def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> DeferredRows:
+        tree = functools.cache(partial(TiedTree, self, points))
 
-        def tree() -> TiedTree:
-            if not built:
-                built.append(TiedTree(self, points))
-            return built[0]
-
-        def find(rows: Any) -> Int[np.ndarray, "n k"]:
+        def find(rows: Any, _: int | None) -> Int[np.ndarray, "n k"]:
             # In the order of the leaves, each query finds the nodes it needs in the processor's caches.
             order = tree().leaf_order() if rows is None else rows
-            nearest, _ = tree().nearest(points[order], num_neighbors)
+            nearest = tree().nearest(points[order], num_neighbors)[0]
             neighbors = np.full((len(order), num_neighbors), -1, np.int32)
             neighbors[order if rows is None else slice(None), : nearest.shape[1]] = nearest
             return neighbors
@@ -134,7 +111,7 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         # A search whose class is defined inside a function cannot be pickled.
         local = "<locals>" in type(self).__qualname__
         anew = None if local else partial(self.neighbors_on_demand, points, num_neighbors)
-        return NeighborsOnDemand(find, (len(points), num_neighbors), anew)
+        return DeferredRows(find, (len(points), num_neighbors), anew)
 
 
 class KDTreeSearch(AbstractTreeSearch):
@@ -158,23 +135,29 @@ class KDTreeSearch(AbstractTreeSearch):
         if self.backend == "pykdtree" and not has_pykdtree():
             raise ValueError("backend: pykdtree is not installed; run: pip install 'mcgicp_jax[fast]'")
 
-    def build(self, points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree | PyKDTree:
+    def build(self, points: Float[np.ndarray, "M D"]) -> Tree:
         if self.backend != "scipy" and has_pykdtree() and points.shape[1] <= MAX_DIMENSIONS:
-            return PyKDTree(points)
+            from pykdtree.kdtree import KDTree
+
+            return _by_one_thread(KDTree, np.ascontiguousarray(points, np.float64))
         return _scipy_tree(points)
 
     def query(
-        self, tree: scipy.spatial.cKDTree | PyKDTree, queries: Float[np.ndarray, "N D"], k: int, bound: float
+        self, tree: Tree, queries: Float[np.ndarray, "N D"], k: int, bound: float
     ) -> tuple[Float[np.ndarray, "N k"], Int[np.ndarray, "N k"]]:
-        if isinstance(tree, PyKDTree):
-            return tree.query(queries, k, bound)
-        return tree.query(queries, k=np.arange(1, k + 1), distance_upper_bound=bound)
+        if isinstance(tree, scipy.spatial.cKDTree):
+            return tree.query(queries, k=np.arange(1, k + 1), distance_upper_bound=bound)
+        queries = np.ascontiguousarray(queries, np.float64)
+        distances, rows = _by_one_thread(tree.query, queries, k=k, distance_upper_bound=bound)
+        return distances.reshape(-1, k), rows.reshape(-1, k).astype(np.int64)
 
-    def leaf_order(self, tree: scipy.spatial.cKDTree | PyKDTree, num_points: int) -> Int[np.ndarray, "M"]:
-        if isinstance(tree, PyKDTree):
-            # pykdtree does not tell its order; building SciPy's tree takes a tenth of the time that the order saves.
-            return _scipy_tree(tree.points).indices if num_points > LARGEST_UNORDERED else np.arange(num_points)
-        return np.asarray(tree.indices)
+    def leaf_order(self, tree: Tree, num_points: int) -> Int[np.ndarray, "M"]:
+        if isinstance(tree, scipy.spatial.cKDTree):
+            return np.asarray(tree.indices)
+        if num_points <= LARGEST_UNORDERED:
+            return np.arange(num_points)
+        # pykdtree does not tell its order; building SciPy's tree takes a tenth of the time that the order saves.
+        return _scipy_tree(tree.data_pts.reshape(-1, tree.ndim)).indices
 
 
 def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:

@@ -103,17 +103,8 @@ class TiedTree:
             Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the k-th nearest
             and the next, which is taken to lie at the bound if none is within it; 0 without a k-th nearest.
         """
-        if self._rows is not None:
-            if k >= self._most_equal:
-                return TiedTree(self._trees, self.points, k + 1).nearest(queries, k, bound)
-            nearest, slack = self._nearest(queries, k, bound)
-            return self._rows[nearest].astype(np.int32), slack
-        return self._nearest(queries, k, bound)
-
-    def _nearest(
-        self, queries: Float[np.ndarray, "N D"], k: int, bound: float
-    ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """`nearest` among the rows of the tree."""
+        if self._rows is not None and k >= self._most_equal:
+            return TiedTree(self._trees, self.points, k + 1).nearest(queries, k, bound)
         size = len(self._held)
         k = min(k, size)
         asked = min(k + 1, size)
@@ -138,7 +129,7 @@ class TiedTree:
                 distances, rows = self.query(queries[tied], asked, bound)
         if tied.size and asked < size:
             nearest[tied] = _nearest_in_all(self._held, queries[tied], farthest[tied], k)
-        return nearest, slack
+        return nearest if self._rows is None else self._rows[nearest].astype(np.int32), slack
 
 
 def _nearest_in_all(
