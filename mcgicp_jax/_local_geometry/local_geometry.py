@@ -98,8 +98,7 @@ def _covariances_of_halves(
     offsets: Offsets, present: Float[Array, "k N"], covariance: Float[Array, "6 N"]
 ) -> tuple[list[Float[Array, "6 N"]], Float[Array, "M"]]:
     """Covariances of two halves of each neighbourhood, whose own `covariance` is known: of every second neighbour, from
-    the first and from the second on. And the numbers of neighbours: in all, in the first and in the second halves (M =
-    3 N)."""
+    the first and from the second on; and the numbers of neighbours in all, in the first and in the second halves."""
     count = jnp.sum(present, axis=0)
     # About the mean of all, so that the sums over one half and over the other add up to those over all.
     x, y, z = (present * (offset - jnp.sum(offset, axis=0) / jnp.maximum(count, 1)) for offset in offsets)
@@ -169,19 +168,15 @@ def local_geometries(
 
 @cached_with_cloud
 def geometry_table(cloud: PointCloud, with_channels: bool) -> ComputedTable:
-    return _table(cloud, with_channels, cloud)
+    return differentiable_geometry(cloud, with_channels)
 
 
-def differentiable_geometry(cloud: PointCloud, with_channels: bool, fixed: PointCloud) -> ComputedTable:
-    """Local geometry of a cloud whose points differentiation may trace; `fixed` is the same cloud, concrete."""
-    return _table(cloud, with_channels, fixed, geometry_table(fixed, with_channels))
-
-
-def _table(
-    cloud: PointCloud, with_channels: bool, fixed: PointCloud, values: ComputedTable | None = None
-) -> ComputedTable:
+def differentiable_geometry(cloud: PointCloud, with_channels: bool, fixed: PointCloud | None = None) -> ComputedTable:
+    """Local geometry of a cloud whose points differentiation may trace: then, `fixed` is the same cloud, concrete."""
+    values = None if fixed is None else geometry_table(fixed, with_channels)
     # A view is another array than the differentiated channels, by which the local geometry has no derivative.
-    inputs = nb.with_near(cloud.replace_rows(channels=np.asarray(fixed.channels).view()), with_channels)
+    channels = np.asarray((cloud if fixed is None else fixed).channels).view()
+    inputs = nb.with_near(cloud.replace_rows(channels=channels), with_channels)
     return ComputedTable(_geometry, None, inputs, cloud.points.shape[0], values)
 
 
