@@ -237,7 +237,7 @@ class BatchJob:
         run = self._run(PreparedPair(pair.index, inputs, pair.init))  # type: ignore[arg-type]
         if isinstance(run, PairResult):
             return run
-        (result,) = map(verified, results_of([run], [None]))
+        (result,) = map(verified, results_of([run], [run.inputs]))
         leaves, structure = jax.tree.flatten(values, is_leaf=is_deferred)
 
         def pose(*traced: Any) -> Any:
@@ -278,7 +278,7 @@ class BatchJob:
         run = self._run(pair)
         if isinstance(run, PairResult):
             return run
-        (result,) = results_of([run], [None])
+        (result,) = results_of([run], [run.inputs])
         return self._result(pair.index, pair.checked(result), pair.doubt or run.doubt)
 
     def register_in_chunks(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:

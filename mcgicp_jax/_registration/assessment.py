@@ -55,18 +55,20 @@ class Assessment(NamedTuple):
         return cls(Lazy.of(constraints_of(state)), Lazy.of(jnp.full((6, 6), jnp.nan)))
 
 
-def assessment_of(executor: AbstractExecutor, loop: LoopResult, moments: Callable[[], Moments]) -> Assessment:
-    state, fusion = loop.state, executor.problem.fusion
+def assessment_of(executor: AbstractExecutor, loop: LoopResult) -> Assessment:
+    state = loop.state
+
+    def weights() -> Moments | Fusion:
+        fusion = executor.problem.fusion
+        return moments_of(executor, loop) if fusion is None else fusion
 
     def covariance() -> Float[np.ndarray, "6 6"]:
         # In float64: unconstrained directions have large variances, next to which others would be lost to rounding.
         with jax.enable_x64(True):
-            weights = moments() if fusion is None else fusion
-            return np.asarray(_covariance_on_host(*as_float64((state._replace(record=None), weights))))
+            return np.asarray(_covariance_on_host(*as_float64((state._replace(record=None), weights()))))
 
     if not is_concrete(state):
-        covariances = covariance_of_pose(state, moments() if fusion is None else fusion)
-        return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariances))
+        return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariance_of_pose(state, weights())))
     return Assessment(Lazy(lambda: jax.tree.map(np.asarray, _constraints_on_host(state))), Lazy(covariance))
 
 

@@ -15,7 +15,6 @@ from mcgicp_jax._clouds.origins import centred_pose, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.preprocess import finite_rows, preprocess, preprocessed_in, with_neighbors
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids
-from mcgicp_jax._compute.cache import Lazy
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for, outside_trace
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn
@@ -38,10 +37,9 @@ from mcgicp_jax._methods.icp import GICP, PointToPoint
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import voxel_gaussians
 from mcgicp_jax._methods.surfaces import surface_pair
-from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matches
-from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of, registration_of
+from mcgicp_jax._registration.assessment import assessment_of, moments_of, registration_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
 from mcgicp_jax._registration.input_checks import (
     check_channels,
@@ -50,7 +48,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_hard_matches,
     warn_of_inputs,
 )
-from mcgicp_jax._registration.loop import CONTRADICTION, LoopResult, Problem, State, squares_from_prior
+from mcgicp_jax._registration.loop import CONTRADICTION, LoopResult, Problem, squares_from_prior
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
@@ -88,17 +86,15 @@ _COARSE_VOXEL = 0.25
 class Run(NamedTuple):
     """A registration that has ended.
 
-    `loop` is constant to autodiff, and so are `inputs` outside `jit`. Inside `jit`, `executor` is None, and the pose of
-    `state()` is differentiable. `doubt` says why a pose is UNVERIFIED, outside `jit`.
+    `loop` is constant to autodiff, and so are `inputs` outside `jit`. Inside `jit`, `executor` is None. `doubt` says
+    why a pose is UNVERIFIED, outside `jit`.
     """
 
     inputs: Inputs
     problem: Problem
     loop: LoopResult
+    search: AbstractSearch | None
     executor: HostExecutor | None
-    state: Callable[[], State]
-    assessment: Callable[[], Assessment]
-    moments: Callable[[], Moments]
     doubt: str = ""
 
 
@@ -127,12 +123,13 @@ def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> Regist
     if not is_concrete(values, numbers):
         # Inside `jit` or `vmap`, whose tracers have no values.
         ended = run(given, *arguments, traced=True)
-    elif is_concrete(given):
-        ended = run(given, *arguments)
-    else:
-        # Inside `grad` or `jvp`: the values are registered, and `results_of` adds the derivative. In a thread, since
-        # calls of programs take longer inside transformations.
-        ended = in_new_thread(partial(run, values, *arguments))
+        used = ended.problem.source.search.valid
+        assessment = assess(ended.loop, jax.lax.stop_gradient(ended.problem), ended.search)
+        state = differentiable(ended.loop, ended.problem, ended.search)
+        return registration_of(state, assessment, ended.loop.history, *given[:2], used, inputs=given)
+    # Inside `grad` or `jvp`: the values are registered, and `results_of` adds the derivative. In a thread, since calls
+    # of programs take longer inside transformations.
+    ended = run(given, *arguments) if is_concrete(given) else in_new_thread(partial(run, values, *arguments))
     if ended.doubt:
         warn(ended.doubt)
     (result,) = results_of([ended], [given])
@@ -196,7 +193,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
     start = init
     for scale in coarse:
-        (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [None])
+        (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [scale])
         start = result.matrix if is_usable(result) else start
     run = solve(inputs, start)
     doubt = ""
@@ -215,7 +212,12 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
     if measures:
         # Again from its pose, with tie points and prior weighed by its covariance.
-        fusion = fusion_of(run.loop.state, run.moments(), run.inputs.tie_points, run.inputs.prior, traced)
+        if run.executor is None:
+            moments = moments_traced(run.loop, jax.lax.stop_gradient(run.problem), search)
+        else:
+            with outside_trace():
+                moments = moments_of(run.executor, run.loop)
+        fusion = fusion_of(run.loop.state, moments, run.inputs.tie_points, run.inputs.prior, traced)
         settings = run.problem.settings
         if options.max_distance is None:
             settings = settings._replace(max_distance=settings.fine_distance)
@@ -236,27 +238,27 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     elif not measures and status == Status.CONVERGED and doubt:
         state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
         doubt = f"the pose is UNVERIFIED: {doubt}"
-        run = run._replace(loop=run.loop._replace(state=state), state=lambda: state, doubt=doubt)
+        run = run._replace(loop=run.loop._replace(state=state), doubt=doubt)
     return run
 
 
 @with_settings_of_package
-def results_of(runs: Sequence[Run], givens: Sequence[Inputs | None]) -> list[RegistrationResult]:
-    """The results; outside `jit`, poses get derivatives by the traced arrays of `givens`, computed side by side."""
+def results_of(runs: Sequence[Run], givens: Sequence[Inputs]) -> list[RegistrationResult]:
+    """The results of runs on the host; poses get derivatives by traced arrays of `givens`, computed side by side."""
     derivatives = [
-        None if given is None or run.executor is None else differentiated(given, run.inputs, run.executor, run.loop)
+        differentiated(given, run.inputs, cast(HostExecutor, run.executor), run.loop)
         for run, given in zip(runs, givens, strict=True)
     ]
-    states = with_derivatives([run.state() for run in runs], derivatives)
+    states = with_derivatives([run.loop.state for run in runs], derivatives)
     results = []
     for state, run, given in zip(states, runs, givens, strict=True):
-        jacobian_by = None if run.executor is None else partial(jacobian, run.inputs, run.executor, run.loop)
         # Cells, whose origin may differ, are made of concrete clouds alone: a traced origin is that of the argument.
-        traces_origins = given is not None and not is_concrete(given.source.origin, given.target.origin)
-        source, target = (given if given is not None and traces_origins else run.inputs)[:2]
-        used = run.problem.source.search.valid
-        ended = state, run.assessment(), run.loop.history, source, target, used, jacobian_by
-        results.append(registration_of(*ended, run.inputs if given is None else given))
+        traces_origins = not is_concrete(given.source.origin, given.target.origin)
+        source, target = (given if traces_origins else run.inputs)[:2]
+        used, executor = run.problem.source.search.valid, cast(HostExecutor, run.executor)
+        jacobian_by = partial(jacobian, run.inputs, executor, run.loop)
+        ended = state, assessment_of(executor, run.loop), run.loop.history, source, target, used, jacobian_by
+        results.append(registration_of(*ended, given))
     return results
 
 
@@ -265,11 +267,8 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
     if traced:
         problem = problem.whole()
         # Gradients stop here, so that autodiff does not enter the compiled functions.
-        fixed = jax.lax.stop_gradient(problem)
-        loop = run_traced(fixed, search, max_iterations)
-        state = partial(differentiable, loop, problem, search)
-        ended = loop, fixed, search
-        return Run(inputs, problem, loop, None, state, partial(assess, *ended), partial(moments_traced, *ended))
+        loop = run_traced(jax.lax.stop_gradient(problem), search, max_iterations)
+        return Run(inputs, problem, loop, search, executor=None)
 
     def index(position_alone: bool) -> AbstractIndex:
         method = PointToPoint() if position_alone else inputs.method
@@ -280,13 +279,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
         loop = executor.run()
         if loop.state.status == Status.NON_FINITE:
             warn_of_extensions(inputs.method, executor, loop)
-    lazy = Lazy(partial(moments_of, executor, loop))
-
-    def moments() -> Moments:
-        return lazy.value
-
-    assessment = partial(assessment_of, executor, loop, moments)
-    return Run(inputs, problem, loop, executor, lambda: loop.state, assessment, moments)
+    return Run(inputs, problem, loop, search, executor)
 
 
 @with_settings_of_package

@@ -121,7 +121,7 @@ def run_traced(problem: Problem, search: AbstractSearch | None, max_iterations: 
 
 @jax.jit
 def assess(loop: LoopResult, problem: Problem, search: AbstractSearch | None) -> Assessment:
-    return assessment_of(TracedExecutor(problem, search, 0), loop, partial(moments_traced, loop, problem, search))
+    return assessment_of(TracedExecutor(problem, search, 0), loop)
 
 
 @jax.jit
