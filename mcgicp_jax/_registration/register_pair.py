@@ -437,23 +437,20 @@ def _at_scales(given: Inputs, voxel_sizes: Sequence[float]) -> Iterator[Inputs]:
     size, and GICP registers smaller voxels at the others. Methods without cells register the voxels of each size, and
     then the clouds."""
 
-    def with_clouds(each: Callable[[str, PointCloud], PointCloud], method: AbstractMethod) -> Inputs:
-        return given._replace(source=each("source", given.source), target=each("target", given.target), method=method)
-
-    method = given.method
+    method, sides = given.method, {"source": given.source, "target": given.target}
     if method.needs_covariances and len(voxel_sizes):
         for size in voxel_sizes[:-1]:
-            yield with_clouds(partial(_in_voxels, _COARSE_VOXEL * size), GICP())
-        yield with_clouds(partial(_in_cells, method, voxel_sizes[-1]), method)
+            source, target = (_in_voxels(name, cloud, _COARSE_VOXEL * size) for name, cloud in sides.items())
+            yield given._replace(source=source, target=target, method=GICP())
+        sides |= {name: _in_cells(name, sides[name], voxel_sizes[-1], method) for name in method.needs_covariances}
+        yield given._replace(source=sides["source"], target=sides["target"])
         return
     for size in voxel_sizes:
-        yield with_clouds(partial(_smaller, size), method)
+        yield given._replace(source=_smaller(given.source, size), target=_smaller(given.target, size))
     yield given
 
 
-def _in_cells(method: AbstractMethod, size: float, name: str, cloud: PointCloud) -> PointCloud:
-    if name not in method.needs_covariances:
-        return cloud
+def _in_cells(name: str, cloud: PointCloud, size: float, method: AbstractMethod) -> PointCloud:
     channel_size: Any = None
     if method.uses_channels:
         # A cell extends as far in α · channel as in position.
@@ -463,10 +460,10 @@ def _in_cells(method: AbstractMethod, size: float, name: str, cloud: PointCloud)
         return voxel_gaussians(cloud, size, channel_size=channel_size)
 
 
-def _in_voxels(size: float, name: str, cloud: PointCloud) -> PointCloud:
+def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
     with messages_named(name):
         return with_neighbors(finite_rows(cloud), size, NUM_NEIGHBORS)
 
 
-def _smaller(size: float, _: str, cloud: PointCloud) -> PointCloud:
+def _smaller(cloud: PointCloud, size: float) -> PointCloud:
     return preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1])
