@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from mcgicp_jax._clouds.origins import pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import Held, Lazy
-from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal, without_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._math.poses import adjoint_to_center, se3_from_matrix, translation_adjoint, units
@@ -31,7 +31,7 @@ from mcgicp_jax._pose_solver.covariance import (
 )
 from mcgicp_jax._pose_solver.degeneracy import directions_at_source
 from mcgicp_jax._pose_solver.fusion import fused_covariance
-from mcgicp_jax._pose_solver.matched import Matches, Motion, sample_of_term
+from mcgicp_jax._pose_solver.matched import Motion, sample_of_term
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Record, State
 from mcgicp_jax._registration.result import Constraints, RegistrationResult, Status, Uncertainty
@@ -73,33 +73,26 @@ def assessment_of(executor: AbstractExecutor, loop: LoopResult) -> Assessment:
 
 
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
-    problem, state = executor.problem, loop.state
-    motion, valid = Motion.of(state.pose.wxyz_xyz), executor.source_of(loop.matches).valid
-    one = np.ones((), problem.source.points.dtype)
+    problem, state, motion = executor.problem, loop.state, Motion.of(loop.state.pose.wxyz_xyz)
+    search = executor.source_of(loop.matches)
+    xp, one = numpy_for(search.valid), np.ones((), problem.source.points.dtype)
     # Padding does not change which cells share a sum.
-    num_cells = numpy_for(valid).maximum(valid.sum(), 1).astype(np.int32)
+    num_cells = xp.maximum(search.valid.sum(), 1).astype(np.int32)
     frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, num_cells)
     if problem.source.observed:
-        discount, neighborhood_radius = _discounts_and_radius(executor, motion, loop.matches)
+        rows, counts = sampled_rows(search.valid)
+        nearest = executor.nearest_candidates(motion, loop.matches.some(rows))
+        sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
+        sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
+        num_channels = xp.sum(xp.any(search.descriptors != 0, axis=0))
+        discount, neighborhood_radius = discounts_and_radius(sample, num_channels)
         frame = frame._replace(discount=discount, neighborhood_radius=neighborhood_radius)
     # Fixed matches do not respond to a motion.
     responding = _responding(executor, loop) if problem.matches is None and is_adaptive(loop.terms) else None
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
     ours, theirs = problem.settings.rounding
     rounding = (motion.rotation * ours) @ motion.rotation.T + numpy_for(theirs).diag(theirs)
-    return moments_from(scores, valid.size)._replace(rounding=rounding)
-
-
-def _discounts_and_radius(
-    executor: AbstractExecutor, motion: Motion, matches: Matches
-) -> tuple[Float[AnyArray, "2"], Float[AnyScalar, ""]]:
-    search = executor.source_of(matches)
-    rows, counts = sampled_rows(search.valid)
-    xp = numpy_for(counts)
-    nearest = executor.nearest_candidates(motion, matches.some(rows))
-    sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
-    sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
-    return discounts_and_radius(sample, xp.sum(xp.any(search.descriptors != 0, axis=0)))
+    return moments_from(scores, search.valid.size)._replace(rounding=rounding)
 
 
 def _responding(executor: AbstractExecutor, loop: LoopResult) -> tuple[AbstractTerm, ...]:
