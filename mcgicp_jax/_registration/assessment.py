@@ -173,8 +173,8 @@ def registration_of(
         numbers = state.status, state.num_iterations, state.record, history, used
         status, num_iterations, record, history, used = jax.tree.map(lambda array: np.asarray(array)[()], numbers)
         state = state._replace(status=status, num_iterations=num_iterations, record=record)
-        pose = state.pose if is_concrete(pose) else pose
     record, num_inliers = state.record, state.record.num_inliers.astype(np.int32)
+    at_origin = is_concrete(origin) and not np.any(origin)
     constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)
     return RegistrationResult.build(
         status_code=state.status,
@@ -185,7 +185,7 @@ def registration_of(
         overlap=(num_inliers / used.sum()).astype(record.rmse.dtype),
         history=history,
         constraints=assessment.constraints
-        if concrete and not np.any(origin)
+        if at_origin
         else _later(lambda: _constraints_in_user_frame(assessment, origin), concrete),
         uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, origin), concrete, constant_by),
         derivative=Held(derivative),
@@ -223,8 +223,6 @@ def _read_only(tree: Any) -> Any:
 
 def _constraints_in_user_frame(assessment: Assessment, origin: Any) -> Constraints:
     information, directions = assessment.constraints.value
-    if is_concrete(origin) and not np.any(origin):
-        return Constraints(information, directions)
     to_centred, from_centred = translation_adjoint(-origin), translation_adjoint(origin)
     # Non-finite values belong to the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):

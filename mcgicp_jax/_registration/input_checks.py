@@ -129,15 +129,13 @@ def _is_extension(part: object) -> bool:
 
 def warn_of_hard_matches(method: AbstractMethod, source: PointCloud, target: PointCloud) -> None:
     """Warn if α or channels are differentiated outside of `jit`, with hard matches, which are constant to autodiff."""
-    weights = getattr(method, "channel_weights", None)
-    if not is_concrete(weights) and is_concrete(primal(weights)):
+    if _is_differentiated(getattr(method, "channel_weights", None)):
         warn(
             "channel_weights: the derivative is 0, since they decide matches alone, which are constant in derivatives; "
             "leave out soft_matches=False"
         )
-    channels = source.channels, target.channels
     compared = isinstance(method, MultiChannelGICP) and method.photometric
-    if method.uses_channels and not compared and not is_concrete(channels) and is_concrete(primal(channels)):
+    if method.uses_channels and not compared and _is_differentiated((source.channels, target.channels)):
         warn(
             "channels: they act mostly by the matches, which are constant in derivatives, so that this one is often a "
             "hundred times too small; leave out soft_matches=False"
@@ -150,31 +148,35 @@ def warn_of_estimated_parameters(
     """Warn if inputs are differentiated outside `jit` from which parameters, constant to autodiff, are estimated: from
     channels Λ, gains, and α of soft matches (α of hard ones decides the matches alone); from points and channels the
     numbers of the photometric term."""
-    channels = source.channels, target.channels
     if not isinstance(method, MultiChannelGICP):
         return
+    channels = source.channels, target.channels
     if method.photometric:
-        values = source.points, target.points, channels
-        if not is_concrete(values) and is_concrete(primal(values)):
+        if _is_differentiated((source.points, target.points, channels)):
             warn(
                 "photometric: standard deviations, gains and offsets are estimated from the residuals, but constant in "
                 "the derivative by points and channels, which is therefore not that of the result"
             )
         return
-    if is_concrete(channels):
+    if not _is_differentiated(channels):
         return
-    if equalize_channels and is_concrete(primal(channels)):
+    if equalize_channels:
         warn(
             "equalize_channels: gain and offset are estimated from the channels, but constant in the derivative by "
             "channels, which is therefore not that of the result; equalise the channels before"
         )
     names = ["channel_covariance", "channel_weights"] if soft else ["channel_covariance"]
     unset = [name for name in names if getattr(method, name) is None]
-    if unset and is_concrete(primal(channels)):
+    if unset:
         warn(
             f"{' and '.join(unset)}: estimated from the channels, but constant in the derivative by channels, which is "
             "therefore not that of the result; pass a method resolved beforehand, method.resolve(source, target)"
         )
+
+
+def _is_differentiated(tree: object) -> bool:
+    """Whether arrays are traced by differentiation outside of `jit` and `vmap`."""
+    return not is_concrete(tree) and is_concrete(primal(tree))
 
 
 def warn_of_lengths(source: PointCloud, target: PointCloud) -> None:
