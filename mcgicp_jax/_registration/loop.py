@@ -349,7 +349,8 @@ def update(
     nearly = nearly & (motion <= _FRACTION_OF_GATE * settings.fine_distance)
     converged = below(settings.translation_tolerance, settings.rotation_tolerance) | (coarse & nearly) | cycles
     finite = jnp.isfinite(sums.energy) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
-    doubtful = settings.channels_may_move & _depends_on_channels(directions)
+    by_channels = False if directions is None else jnp.any(directions.constrained_by_channels)
+    doubtful = settings.channels_may_move & by_channels
     outcomes: tuple[tuple[Array, int], ...] = (
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
@@ -376,10 +377,6 @@ def update(
         directions=directions,
         record=Record(*(number.astype(sums.center.dtype) for number in record)),
     )
-
-
-def _depends_on_channels(directions: Directions | None) -> Bool[AnyScalar, ""]:
-    return np.bool_(False) if directions is None else jnp.any(directions.constrained_by_channels)
 
 
 def squares_from_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Float[AnyScalar, ""]:

@@ -105,7 +105,13 @@ class HostExecutor(AbstractExecutor):
         arguments = terms, self.problem.settings.near, np.bool_(last)
         applied = self._over(sums_of, motion, matches, arguments, with_slopes)
         parts: list[Packed[Sums]] = applied.sums(self._num_threads if with_slopes else 1)
-        return parts[0] if len(parts) == 1 else _combined(parts)
+        if len(parts) == 1:
+            return parts[0]
+        tables, dtype = np.stack([part.table for part in parts]), parts[0].table.dtype
+        with np.errstate(over="ignore"):
+            sums = combine(Packed(tables.astype(np.float64), parts[0].layout).tree)
+            table = np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(sums)]).astype(dtype)
+        return Packed(table, parts[0].layout)
 
     def update(self, state: State, sums: Packed[Sums]) -> State:
         updated = _update(state[:5], sums, self._settings, self.problem.measurements, self.problem.fixed)
@@ -131,14 +137,6 @@ class HostExecutor(AbstractExecutor):
             for name in ("wrenches", "valid", "cells")
         )
         return Scores(wrenches, valid, cells, jacobian, bias)
-
-
-def _combined(parts: list[Packed[Sums]]) -> Packed[Sums]:
-    tables, dtype = np.stack([part.table for part in parts]), parts[0].table.dtype
-    with np.errstate(over="ignore"):
-        sums = combine(Packed(tables.astype(np.float64), parts[0].layout).tree)
-        table = np.concatenate([each.ravel() for each in jax.tree.leaves(sums)]).astype(dtype)
-    return Packed(table, parts[0].layout)
 
 
 @partial(quickly_compiled, level=1)

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -71,10 +70,10 @@ class TracedExecutor(AbstractExecutor):
             return before
         # Under `vmap` the body also runs for registrations that have ended: no search for them.
         running = (status < 0) & (status != SETTLED)
-        source, target = (
-            _every(settings.stride(status, state.num_iterations), problem.source.search),
-            problem.target.search,
-        )
+        source, target = problem.source.search, problem.target.search
+        # Rows that are not in the stride are marked as invalid, so that they match nothing.
+        taken = jnp.arange(source.valid.size) % settings.stride(status, state.num_iterations) == 0
+        source = source._replace(valid=source.valid & taken)
         if any(term.by_position for term in problem.terms):
             source, target = (_without_descriptors(status != COARSE, each) for each in (source, target))
         limit, pose = settings.max_distance, state.pose.wxyz_xyz
@@ -148,9 +147,3 @@ def _without_descriptors(where: Bool[Array, ""], rows: SearchPoints) -> SearchPo
     factor = jnp.where(where, 0, 1).astype(rows.points.dtype)
     penalty = None if rows.penalty is None else factor * rows.penalty
     return SearchPoints(rows.points, factor * rows.descriptors, rows.valid, penalty)
-
-
-def _every(stride: Int[Array, ""], source: SearchPoints) -> SearchPoints:
-    """Mark all but every `stride`-th row as invalid, so that they match nothing."""
-    chosen = jnp.arange(source.valid.size) % stride == 0
-    return eqx.tree_at(lambda rows: rows.valid, source, source.valid & chosen)
