@@ -126,7 +126,8 @@ def run_pairs(
     sizes: list[tuple[int, int]] = []
     for number, (key, pair) in enumerate(pairs):
         pair = _fitted(pair, sizes)
-        kind = _shapes(pair)
+        leaves, structure = jax.tree.flatten(pair)
+        kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         if kind not in groups:
             groups[kind] = _Group(program, mesh, fixed.max_iterations)
         last[kind] = number
@@ -257,11 +258,6 @@ def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
         return pair
     source, target = min(suitable, key=np.prod)
     return pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
-
-
-def _shapes(tree: Any) -> Any:
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
 
 
 @with_settings_of_package

@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
-from mcgicp_jax._compute.concrete import constant, is_concrete
+from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import check_integer, check_positive
 from mcgicp_jax._compute.threads import with_settings_of_package
@@ -74,24 +74,23 @@ def find_correspondences(
     if not traced:
         gate = float(np.asarray(max_distance))
         nearest = index_of(search, method, target).nearest(np.asarray(start), rows, gate, num_candidates)
-        indices = np.maximum(nearest, 0)
+        indices = np.maximum(nearest, 0).astype(np.int32)
         matrix = np.asarray(matrix)
         # By NumPy, so that nothing is compiled.
         with np.errstate(invalid="ignore"):
             moved: Any = rotated(rows.points.astype(np.float64), matrix[:3, :3]) + matrix[:3, 3]
             distances = np.linalg.norm(target_rows.points[indices] - moved, axis=-1).astype(dtype)
-            valid = (nearest >= 0) & rows.valid & target_rows.valid[indices] & (distances <= gate)
-        matches = Correspondences(indices.astype(np.int32), distances, valid)
+            near = distances <= gate
     else:
         limit = jnp.asarray(max_distance, dtype)
         nearest = search.nearest_traced(start, rows, target_rows, limit, jnp.bool_(True), num_candidates)
         indices = jnp.maximum(nearest, 0)
         moved = Motion(jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)).move(rows.points)
-        valid = (nearest >= 0) & rows.valid & jnp.asarray(target_rows.valid)[indices]
         targets = jnp.asarray(target_rows.points)[indices]
         within = [distances_within(moved, candidate, limit) for candidate in targets]
         distances, near = map(jnp.stack, zip(*within, strict=True))
-        matches = Correspondences(indices, distances, valid & near)
+    counts = (nearest >= 0) & rows.valid & numpy_for(nearest).asarray(target_rows.valid)[indices]
+    matches = Correspondences(indices, distances, counts & near)
     return matches if num_candidates > 1 else jax.tree.map(itemgetter(0), matches)
 
 

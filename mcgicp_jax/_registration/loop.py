@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -31,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._math.poses import move_pose, units
-from mcgicp_jax._methods.surfaces import AnySurface, whole_surface
+from mcgicp_jax._methods.surfaces import AnySurface
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import first_force, fused_update
@@ -94,9 +93,6 @@ class Problem(eqx.Module):
     widens_kernels: bool = eqx.field(static=True, default=False)
     # As in `PointCloud`.
     __getattribute__ = object.__getattribute__
-
-    def whole(self) -> Problem:
-        return replace(self, source=whole_surface(self.source), target=whole_surface(self.target))
 
     @property
     def fusion(self) -> Fusion | None:

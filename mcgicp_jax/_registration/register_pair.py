@@ -36,7 +36,7 @@ from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.icp import GICP, PointToPoint
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import voxel_gaussians
-from mcgicp_jax._methods.surfaces import surface_pair
+from mcgicp_jax._methods.surfaces import surface_pair, whole_surface
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matches
 from mcgicp_jax._registration.assessment import assessment_of, moments_of, registration_of
@@ -206,10 +206,10 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         run, doubt = _unless_left(run, init, len(coarse) > 0, closely)
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
-        again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run, search))
+        again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run))
         run = solve(again, _final_pose(run), replace(options, max_coarse_distance=0.0))
     elif not traced and given.method.uses_channels and not options.equalize_channels:
-        warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run, search))
+        warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run))
     if measures:
         # Again from its pose, with tie points and prior weighed by its covariance.
         if run.executor is None:
@@ -265,7 +265,7 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs]) -> list[Registrati
 def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, max_iterations: int, traced: bool) -> Run:
     """Run the loop on the host or inside `jit`; without a search for a problem with fixed matches."""
     if traced:
-        problem = problem.whole()
+        problem = replace(problem, source=whole_surface(problem.source), target=whole_surface(problem.target))
         # Gradients stop here, so that autodiff does not enter the compiled functions.
         loop = run_traced(jax.lax.stop_gradient(problem), search, max_iterations)
         return Run(inputs, problem, loop, search, executor=None)
@@ -407,11 +407,11 @@ def _final_pose(run: Run) -> Pose:
     return constant(pose_in_user_frame(run.loop.state.pose, run.inputs.source.origin, run.inputs.target.origin))
 
 
-def _nearest_points(run: Run, search: AbstractSearch) -> Correspondences:
+def _nearest_points(run: Run) -> Correspondences:
     """Nearest matches in position at the final pose."""
     source, target = run.inputs[:2]
-    distance = run.problem.settings.fine_distance
-    return find_correspondences(source, target, _final_pose(run), PointToPoint(), max_distance=distance, search=search)
+    limit = run.problem.settings.fine_distance
+    return find_correspondences(source, target, _final_pose(run), PointToPoint(), max_distance=limit, search=run.search)
 
 
 def preprocessed(
