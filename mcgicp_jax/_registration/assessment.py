@@ -210,15 +210,15 @@ def _later(compute: Callable[[], Any], concrete: bool, constant_by: Callable[[An
             # Read after the end of the differentiation.
             return values
 
-    return Lazy(lambda: _read_only(compute()), finish) if concrete else Lazy.of(constant_by(compute()))
+    def read_only() -> Any:
+        values = compute()
+        # Arrays that a result keeps must not change.
+        for array in jax.tree.leaves(values):
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+        return values
 
-
-def _read_only(tree: Any) -> Any:
-    """NumPy arrays that a result keeps must not change."""
-    for array in jax.tree.leaves(tree):
-        if isinstance(array, np.ndarray):
-            array.setflags(write=False)
-    return tree
+    return Lazy(read_only, finish) if concrete else Lazy.of(constant_by(compute()))
 
 
 def _constraints_in_user_frame(assessment: Assessment, origin: Any) -> Constraints:

@@ -100,13 +100,13 @@ class Problem(eqx.Module):
         return self.measurements if isinstance(self.measurements, Fusion) else None
 
     @property
-    def first_status(self) -> Int[AnyScalar, ""]:
-        """`COARSE` where the coarse phase differs from the fine one, and always for terms that adapt."""
-        if is_adaptive(self.terms) and self.matches is None:
-            return np.int32(COARSE)
-        settings = self.settings
+    def first_state(self) -> State:
+        """The status is `COARSE` if that phase differs from the fine one, and always for terms that adapt."""
+        settings, dtype = self.settings, self.start.wxyz_xyz.dtype
         coarse: Any = (settings.fine_distance < settings.max_distance) | (settings.coarse_stride > 1)
-        return numpy_for(coarse).where(coarse, np.int32(COARSE), np.int32(RUNNING))
+        coarse = coarse | (is_adaptive(self.terms) and self.matches is None)
+        status = numpy_for(coarse).where(coarse, np.int32(COARSE), np.int32(RUNNING))
+        return State(self.start, status, np.int32(0), np.zeros(6, dtype), np.zeros((), dtype))
 
     def terms_at(self, status: Int[AnyScalar, ""], terms: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
         """The terms as they act at this status: kernels are wide in the coarse phase, if they are to be widened."""

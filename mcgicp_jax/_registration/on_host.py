@@ -38,11 +38,7 @@ class HostExecutor(AbstractExecutor):
         self._settings = Packed.of(problem.settings, num_axes=0)
 
     def run(self) -> LoopResult:
-        problem = self.problem
-        dtype = problem.source.points.dtype
-        still = np.zeros(6, dtype), np.zeros((), dtype)
-        state = State(problem.start, np.asarray(problem.first_status), np.int32(0), *still)
-        loop, history = LoopResult(state, None, problem.terms, None), []
+        loop, history = LoopResult(self.problem.first_state, None, self.problem.terms, None), []
         while loop.state.status < 0:
             loop = self.step(loop)
             history.append(loop.state.record)
@@ -60,18 +56,16 @@ class HostExecutor(AbstractExecutor):
             return before
         stride = int(settings.stride(status, state.num_iterations))
         alone = bool(status != COARSE and any(map(attrgetter("by_position"), problem.terms)))
-        every = slice(None, None, stride)
         source: SearchPoints = problem.source.search
+        rows = None if stride == 1 else np.arange(problem.source.num_points)[::stride]
         if stride > 1:
-            source = jax.tree.map(lambda array: array[every], source)
+            source = jax.tree.map(lambda array: array[::stride], source)
         if self._follow is None or (stride, alone) != self._followed:
-            self._followed, limit = (stride, alone), float(settings.max_distance)
-            among = by_position(source) if alone else source
-            self._follow = self._index_of(alone).follow(
-                jax.tree.map(np.ascontiguousarray, among), limit, problem.num_candidates
-            )
+            followed = jax.tree.map(np.ascontiguousarray, by_position(source) if alone else source)
+            follow = self._index_of(alone).follow
+            self._follow = follow(followed, float(settings.max_distance), problem.num_candidates)
+            self._followed = stride, alone
         indices = self._follow(state.pose.wxyz_xyz)
-        rows = None if stride == 1 else np.arange(problem.source.num_points)[every]
         return Matches.of(source, problem.target.search, indices, settings.distance(status), rows)
 
     def nearest(

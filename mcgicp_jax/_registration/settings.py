@@ -115,14 +115,11 @@ def settings_for(
     channels_may_move: Any,
     dtype: Any,
 ) -> Settings:
-    max_distance: Any = options.max_distance
-    tolerance: Any = options.translation_tolerance
     # Settings are constants to autodiff, even if they are derived from a differentiated cloud.
     spacing = constant(spacing_of(method, target))
-    max_distance = default_distances(spacing, target) if max_distance is None else max_distance
+    max_distance: Any = default_distances(spacing, target) if options.max_distance is None else options.max_distance
     least = spacing * _TOLERANCE_IN_SPACINGS
-    tolerance = least if tolerance is None else tolerance
-
+    tolerance: Any = least if options.translation_tolerance is None else options.translation_tolerance
     steps = [harmful_steps(constant(cloud), spacing) for cloud in (source, target)]
     near = _NEAR * _median_range(constant(source))
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2

@@ -157,15 +157,11 @@ def measured(
     count = xp.maximum(xp.sum(valid), 1)
     mean = xp.sum(xp.where(valid, rows.points, 0), axis=0) / count
     square = xp.sum(xp.where(valid, rows.points - mean, 0) ** 2) / count
-    place = (
-        matrix[:3, :3],
-        matrix[:3, 3],
-        matrix[:3, :3] @ mean + matrix[:3, 3],
-        xp.sqrt(xp.where(square > 0, square, 1)),
-    )
+    rotation, translation, radius = matrix[:3, :3], matrix[:3, 3], xp.sqrt(xp.where(square > 0, square, 1))
+    place = rotation, translation, rotation @ mean + translation, radius
     form, settings = form_at(*place, ties, prior), problem.settings
     if limits and prior is not None:
-        most = xp.asarray(place[3] * _distance_to_prior(place[0], form.prior), dtype)
+        most = xp.asarray(radius * _distance_to_prior(rotation, form.prior), dtype)
         nearer = xp.maximum(xp.minimum(settings.max_distance, most), settings.fine_distance)
         settings = settings._replace(max_distance=xp.asarray(nearer))
     measurements = as_dtype(PoseMeasurements(*place, form))
@@ -194,13 +190,14 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
         # Reading NumPy arrays compiles nothing.
         center, directions = jax.tree.map(np.asarray, (center, directions))
     form = form_at(matrix[:3, :3], matrix[:3, 3], center, directions.radius, ties, prior)
-    if not traced:
+    if traced:
+        # The form alone has a derivative.
+        fusion = fuse(state.pose, center, directions, moments, constant(form))
+        fusion = eqx.tree_at(lambda fusion: fusion.form, fusion, form)
+    else:
         with jax.enable_x64(True), outside_trace():
             fusion = fuse(*as_float64((state.pose, center, directions, moments, form)))
-        return jax.tree.map(lambda array: np.asarray(array, None if array.dtype == bool else dtype), fusion)
-    fusion = fuse(state.pose, center, directions, moments, constant(form))
-    # The form alone has a derivative.
-    fusion = eqx.tree_at(lambda fusion: fusion.form, fusion, form)
+        fusion = jax.tree.map(np.asarray, fusion)
     return jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
 
 

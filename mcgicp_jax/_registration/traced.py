@@ -35,17 +35,16 @@ class TracedExecutor(AbstractExecutor):
         self._search, self._max_iterations = search, max_iterations
 
     def begin(self) -> LoopResult:
-        problem, first = self.problem, jnp.asarray(self.problem.first_status)
+        problem, first = self.problem, self.problem.first_state
         nowhere = jnp.full((problem.num_candidates, problem.source.num_points), -1, jnp.int32)
         matches = problem.matches or Matches(nowhere, jnp.zeros_like(problem.settings.fine_distance))
         terms = jax.tree.map(jnp.asarray, problem.terms)
-        still = jnp.zeros((6,), problem.start.wxyz_xyz.dtype), jnp.zeros((), problem.start.wxyz_xyz.dtype)
-        loop = LoopResult(State(problem.start, first, jnp.int32(0), *still), matches, terms, None)
+        loop = LoopResult(first, matches, terms, None)
         after = jax.eval_shape(lambda: super(TracedExecutor, self).step(loop).state)
         state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), after)
         # One entry per update, and one at the returned pose.
         history = jax.tree.map(lambda leaf: jnp.full(self._max_iterations + 1, jnp.nan, leaf.dtype), state.record)
-        return loop._replace(state=state._replace(pose=problem.start, status=first), history=history)
+        return loop._replace(state=state._replace(pose=first.pose, status=first.status), history=history)
 
     def run(self, max_updates: Any = None) -> LoopResult:
         """The loop at its end, or after `max_updates`, with a negative status."""
