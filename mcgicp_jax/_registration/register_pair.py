@@ -52,7 +52,7 @@ from mcgicp_jax._registration.loop import CONTRADICTION, LoopResult, Problem, sq
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
-from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status, is_usable
+from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status
 from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
     BETTER,
@@ -184,8 +184,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     def solve(inputs: Inputs, init: Pose | None, options: Options = options) -> Run:
         problem, inputs = problem_of(inputs, init, options, search.num_threads)
         if measures:
-            limits = options.max_distance is None
-            problem = measured(problem, given.tie_points, given.prior, traced, limits=limits)
+            problem = measured(problem, given.tie_points, given.prior, traced, limits=options.max_distance is None)
         return run_loop(inputs, problem, search, options.max_iterations, traced)
 
     if not traced:
@@ -193,17 +192,15 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
     start = init
     for scale in coarse:
-        (result,) = results_of([solve(scale, start, replace(options, max_distance=None))], [scale])
-        start = result.matrix if is_usable(result) else start
+        run = solve(scale, start, replace(options, max_distance=None))
+        start = _final_pose(run) if run.loop.state.status in USABLE else start
     run = solve(inputs, start)
     doubt = ""
     # A given coarse distance says how far off the initial pose may be.
     if not traced and options.max_distance is None:
-
-        def closely(max_distance: float) -> Run:
-            return solve(inputs, init, replace(options, max_distance=max_distance))
-
-        run, doubt = _unless_left(run, init, len(coarse) > 0, closely)
+        run, doubt = _unless_left(
+            run, init, len(coarse) > 0, lambda limit: solve(inputs, init, replace(options, max_distance=limit))
+        )
     if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run))
