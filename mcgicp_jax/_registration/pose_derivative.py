@@ -105,6 +105,7 @@ class PoseDerivative(AbstractLinearMap):
         )
         temperature = matches.temperature if inputs.temperature is None else inputs.temperature
         numbers = Motion.of(self._pose), self._scaling, with_numbers_of(terms, loop.terms), temperature
+        # g, without tie points and prior.
         self._scored = RowFunction(_score_of_rows, numbers, tables, matches.indices.shape[1], total=True)
         traced = [leaf for leaf in self._form if not is_concrete(leaf)]
         self.arrays = list(arrays) or self._scored.tracers + traced
@@ -112,8 +113,8 @@ class PoseDerivative(AbstractLinearMap):
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         slopes = {id(self.arrays[i]): tangent for i, tangent in zip(moving, tangents, strict=True)}
         pose, inverse, _ = self._root
-        count = len(tangents[0])
-        change = np.broadcast_to(self._score(pose).jvp(slopes), (count, 6))
+        score, count = self._scored.at(Motion.of(pose)), len(tangents[0])
+        change = np.broadcast_to(score.jvp(slopes), (count, 6))
         if self._fusion is not None:
             by_score, by_form = self._by_balance(np.eye(6))
             change = change @ by_score.T
@@ -131,14 +132,10 @@ class PoseDerivative(AbstractLinearMap):
         arrays = [self.arrays[i] for i in moving]
         # The score has six numbers, so more cotangents of it are combinations of six.
         rows = by_score if len(by_score) <= 6 else np.eye(6)
-        slopes = self._score(pose).cotangents(rows.astype(pose.dtype), arrays)
+        slopes = self._scored.at(Motion.of(pose)).cotangents(rows.astype(pose.dtype), arrays)
         slopes = slopes if rows is by_score else [np.tensordot(by_score, slope, 1) for slope in slopes]
         by_leaf = {id(leaf): by for leaf, by in zip(self._form, by_form, strict=True)}
         return [by_leaf.get(id(array), slope) for array, slope in zip(arrays, slopes, strict=True)]
-
-    def jacobian(self) -> list[np.ndarray]:
-        """(7, ...) derivative of the pose parameters by each of the arrays."""
-        return self.vjp([np.eye(7)], tuple(range(len(self.arrays))))
 
     def _by_balance(self, cotangents: Float[np.ndarray, "c 6"]) -> tuple[np.ndarray, list[np.ndarray]]:
         """Cotangents of the score and of the leaves of the form, from those of the equation with both."""
@@ -147,16 +144,12 @@ class PoseDerivative(AbstractLinearMap):
         by_score, by_form = jax.tree.map(np.asarray, slopes)
         return by_score, jax.tree.leaves(by_form) if self._form else []
 
-    def _score(self, pose: Float[np.ndarray, "7"]) -> RowFunction:
-        """g at a pose, without tie points and prior."""
-        return self._scored.at(Motion.of(pose))
-
     @cached_property
     def _root(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
         """The root near the final pose, by Newton's method, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ and g there; 0 if there is none."""
         pose, root = self._pose, self._scaling
         for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
-            score, by_motion = self._score(pose).value_and_jacobian((0, 1))
+            score, by_motion = self._scored.at(Motion.of(pose)).value_and_jacobian((0, 1))
             slopes = np.column_stack([slope.reshape(6, -1) for slope in by_motion]) @ self._motion_by_twist(pose)
             both = np.column_stack([score, slopes])
             if self._fusion is not None:
@@ -231,7 +224,7 @@ def jacobian(
     array = getattr(getattr(inputs, cloud), field)
     if array is None:
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
-    (by_array,) = PoseDerivative(inputs, inputs, executor, loop, [array]).jacobian()
+    (by_array,) = PoseDerivative(inputs, inputs, executor, loop, [array]).vjp([np.eye(7)], (0,))
     if inputs.gains is not None and (cloud, field) == ("source", "channels"):
         by_array = by_array * inputs.gains
     pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), Motion.of(loop.state.pose.wxyz_xyz).rotation
