@@ -162,23 +162,20 @@ def registration_of(
 ) -> RegistrationResult:
     """The result of a final state, in the user's frames; NumPy where everything is concrete. `used` marks the source
     points that could be matched. Only the pose has a derivative by traced `inputs`."""
-    history: dict[str, Any] = records._asdict()
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
     pose, source_origin, target_origin = state.pose, source.origin, target.origin
     fixed_pose, origin = primal((pose, source_origin))
-    state = state._replace(pose=fixed_pose)
-    concrete = is_concrete(state.status)
+    at_origin, concrete = is_concrete(origin) and not np.any(origin), is_concrete(state.status)
+    numbers: Any = state.status, state.num_iterations, state.record, records._asdict(), used
     if concrete:
         # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
-        numbers = state.status, state.num_iterations, state.record, history, used
-        status, num_iterations, record, history, used = jax.tree.map(lambda array: np.asarray(array)[()], numbers)
-        state = state._replace(status=status, num_iterations=num_iterations, record=record)
-    record, num_inliers = state.record, state.record.num_inliers.astype(np.int32)
-    at_origin = is_concrete(origin) and not np.any(origin)
+        numbers = jax.tree.map(lambda array: np.asarray(array)[()], numbers)
+    status, num_iterations, record, history, used = numbers
+    num_inliers, center = record.num_inliers.astype(np.int32), state.sums.center
     constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)
     return RegistrationResult.build(
-        status_code=state.status,
-        num_iterations=state.num_iterations,
+        status_code=status,
+        num_iterations=num_iterations,
         num_inliers=num_inliers,
         cost=constant_by(record.cost),
         rmse=constant_by(record.rmse),
@@ -187,7 +184,9 @@ def registration_of(
         constraints=assessment.constraints
         if at_origin
         else _later(lambda: _constraints_in_user_frame(assessment, origin), concrete),
-        uncertainty=_later(lambda: _uncertainty_in_user_frame(assessment, state, origin), concrete, constant_by),
+        uncertainty=_later(
+            lambda: _uncertainty_in_user_frame(assessment, fixed_pose, center, origin), concrete, constant_by
+        ),
         derivative=Held(derivative),
         **fields_of_pose(pose, source_origin, target_origin),
     )
@@ -232,9 +231,9 @@ def _constraints_in_user_frame(assessment: Assessment, origin: Any) -> Constrain
         return Constraints(to_centred.T @ information @ to_centred, directions)
 
 
-def _uncertainty_in_user_frame(assessment: Assessment, state: State, origin: Any) -> Uncertainty:
+def _uncertainty_in_user_frame(assessment: Assessment, pose: jaxlie.SE3, center: Any, origin: Any) -> Uncertainty:
     """The covariance in the frame of the user's source, and the deviations at the centroid of the matched points."""
-    pose, center = constant((state.pose, state.sums.center))
+    pose, center = constant((pose, center))
     covariance = assessment.covariance.value
     xp = numpy_for(covariance, pose, center)
     with np.errstate(invalid="ignore", over="ignore"):

@@ -144,9 +144,7 @@ class _Group(Generic[Key]):
     """Pairs of the same shapes, in chunks. Where memory does not suffice, chunks are halved and begin again."""
 
     def __init__(self, program: Callable[..., Any], mesh: Mesh, max_iterations: int):
-        self._program, self._num_devices = program, mesh.size
-        self._sharding = NamedSharding(mesh, PartitionSpec("pairs"))
-        self._on_cpu = mesh.devices[0].platform == "cpu"
+        self._program, self._mesh = program, mesh
         # A loop that has not ended has made at most one update less.
         self._all_updates = max_iterations + 1
         self._first_updates = min(_FIRST_UPDATES, self._all_updates)
@@ -159,13 +157,13 @@ class _Group(Generic[Key]):
 
     def _largest(self) -> int:
         """The largest number of pairs of a chunk per device."""
-        if self._on_cpu:
+        if self._mesh.devices[0].platform == "cpu":
             return _SIZE_ON_CPU
         rows = sum(cloud.valid.size for cloud in self.waiting[0][1][2:])
         return max(size for size in _SIZES if size * rows <= _ROWS or size == _SIZES[0])
 
     def is_full(self) -> bool:
-        return len(self.waiting) >= (self._per_device or self._largest()) * self._num_devices
+        return len(self.waiting) >= (self._per_device or self._largest()) * self._mesh.size
 
     def finish(self) -> Iterator[Ended[Key] | Refused[Key]]:
         while self.waiting or self._slow or self._dispatched:
@@ -203,9 +201,9 @@ class _Group(Generic[Key]):
         """Start the program for the next pairs; copies of the last one fill up the chunk."""
         if not self._per_device:
             most = self._largest()
-            wanted = -(-len(self.waiting) // self._num_devices)
+            wanted = -(-len(self.waiting) // self._mesh.size)
             self._per_device = next((size for size in _SIZES if wanted <= size < most), most)
-        size = self._per_device * self._num_devices
+        size = self._per_device * self._mesh.size
         late = len(self._slow) >= size or self._chunks_waited >= _CHUNKS_BETWEEN
         first = bool(self.waiting) and not late
         self._chunks_waited = self._chunks_waited + 1 if first and self._slow else 0
@@ -214,7 +212,8 @@ class _Group(Generic[Key]):
         # Before the program starts, so that no pair is lost if memory does not suffice.
         self._dispatched.append((pairs, first, None))
         filled = [pair for _, pair in pairs] + [pairs[-1][1]] * (size - len(pairs))
-        chunk = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *filled), self._sharding)
+        sharding = NamedSharding(self._mesh, PartitionSpec("pairs"))
+        chunk = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *filled), sharding)
         limit = np.int32(self._first_updates if first else self._all_updates)
         self._dispatched[-1] = pairs, first, self._program(chunk, limit)
 

@@ -19,10 +19,7 @@ from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
-from mcgicp_jax._local_geometry.cloud_statistics import (
-    warn_of_exposure,
-    with_channels_matched,
-)
+from mcgicp_jax._local_geometry.cloud_statistics import warn_of_exposure, with_channels_matched
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._local_geometry.sensor_patterns import (
     channels_may_move,
@@ -297,7 +294,7 @@ def problem_of(
         num_threads=num_threads,
         source_rows=rows,
     )
-    dtype, valid = source.points.dtype, pair.source.search.valid
+    valid = pair.source.search.valid
     xp = numpy_for(valid)
     stride = xp.maximum(xp.sum(xp.asarray(valid)) // _COARSE_ROWS, 1) if matches is None else 1
     soft = options.soft_matches
@@ -308,11 +305,11 @@ def problem_of(
     observes_channels = method.uses_channels and matches is None and source.channels.shape[-1]
     may_move = channels_may_move(source) if observes_channels else False
     problem = Problem(
-        se3_from_matrix(centred_pose(init, source, target), dtype),
+        se3_from_matrix(centred_pose(init, source, target), source.points.dtype),
         pair.source,
         pair.target,
         pair.terms,
-        settings_for(options, pair.method, source, target, stride, may_move, dtype),
+        settings_for(options, pair.method, source, target, stride, may_move),
         matches=matches,
         num_candidates=pair.method.num_candidates,
         temperature=constant(spacing_of(pair.method, target)) if soft else None,

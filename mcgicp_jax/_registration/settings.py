@@ -107,13 +107,7 @@ def _median_range(source: PointCloud) -> Float[AnyScalar, ""]:
 
 
 def settings_for(
-    options: Options,
-    method: AbstractMethod,
-    source: PointCloud,
-    target: PointCloud,
-    stride: Any,
-    channels_may_move: Any,
-    dtype: Any,
+    options: Options, method: AbstractMethod, source: PointCloud, target: PointCloud, stride: Any, may_move: Any
 ) -> Settings:
     # Settings are constants to autodiff, even if they are derived from a differentiated cloud.
     spacing = constant(spacing_of(method, target))
@@ -124,7 +118,8 @@ def settings_for(
     near = _NEAR * _median_range(constant(source))
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
     limits, turn = (options.min_coarse_distance, options.max_coarse_distance), options.rotation_tolerance
-    others = options.hold_unconstrained, channels_may_move, stride
+    dtype = source.points.dtype
+    others = options.hold_unconstrained, may_move, stride
     xp: Any = numpy_for(coarse, fine, limits, tolerance, least, turn, others, steps, near)
     # Steps of huge coordinates overflow.
     with np.errstate(over="ignore"):
@@ -140,7 +135,7 @@ def settings_for(
         coarse_rotation_tolerance=xp.asarray(_COARSE_TOLERANCE * xp.maximum(turn, ROTATION_TOLERANCE), dtype),
         max_iterations=xp.asarray(options.max_iterations, np.int32),
         hold_unconstrained=xp.asarray(options.hold_unconstrained, bool),
-        channels_may_move=xp.asarray(channels_may_move, bool),
+        channels_may_move=xp.asarray(may_move, bool),
         rounding=xp.asarray(rounding, dtype),
         near=xp.asarray(near, dtype),
     )
