@@ -156,21 +156,21 @@ def registration_of(
     records: Record,
     source: PointCloud,
     target: PointCloud,
-    used: Bool[AnyArray, "n"],
+    matchable: Bool[AnyArray, "n"],
     derivative: Callable[[str, str], np.ndarray] | None = None,
     inputs: Any = None,
 ) -> RegistrationResult:
-    """The result of a final state, in the user's frames; NumPy where everything is concrete. `used` marks the source
+    """The result of a final state, in the user's frames; NumPy where everything is concrete. `matchable`: the source
     points that could be matched. Only the pose has a derivative by traced `inputs`."""
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
     pose, source_origin, target_origin = state.pose, source.origin, target.origin
     fixed_pose, origin = primal((pose, source_origin))
     at_origin, concrete = is_concrete(origin) and not np.any(origin), is_concrete(state.status)
-    numbers: Any = state.status, state.num_iterations, state.record, records._asdict(), used
+    numbers: Any = state.status, state.num_iterations, state.record, records._asdict(), matchable
     if concrete:
         # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
         numbers = jax.tree.map(lambda array: np.asarray(array)[()], numbers)
-    status, num_iterations, record, history, used = numbers
+    status, num_iterations, record, history, matchable = numbers
     num_inliers, center = record.num_inliers.astype(np.int32), state.sums.center
     constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)
     return RegistrationResult.build(
@@ -179,7 +179,7 @@ def registration_of(
         num_inliers=num_inliers,
         cost=constant_by(record.cost),
         rmse=constant_by(record.rmse),
-        overlap=(num_inliers / used.sum()).astype(record.rmse.dtype),
+        overlap=(num_inliers / matchable.sum()).astype(record.rmse.dtype),
         history=history,
         constraints=assessment.constraints
         if at_origin

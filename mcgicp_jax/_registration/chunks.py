@@ -279,15 +279,15 @@ def _registered(
 
     def registered(pair: ChunkPair, common: Any) -> Any:
         method, robust, numbers, max_updates = common
-        own = replace(options, **numbers | {"max_coarse_distance": pair.max_coarse_distance})
+        complete = replace(options, **numbers | {"max_coarse_distance": pair.max_coarse_distance})
         source, target = pair.source, pair.target
         if method.uses_channels:
             source, target = without_sensor_patterns(source, target, method)
-        problem, inputs = problem_of(Inputs(source, target, method, robust), None, own, 1)
+        problem, inputs = problem_of(Inputs(source, target, method, robust), None, complete, 1)
         problem = replace(problem, start=pair.start)
         executor = TracedExecutor(problem, search, options.max_iterations)
         loop = executor.run(max_updates)
-        check = (problem.settings, surface_fit(inputs, executor, loop)) if own.max_distance is None else None
+        check = (problem.settings, surface_fit(inputs, executor, loop)) if complete.max_distance is None else None
         assessment = assess(loop, problem, search) if covariances else Assessment.without_covariance(loop.state)
         return loop.state, assessment, loop.history, check
 

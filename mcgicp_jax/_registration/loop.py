@@ -191,8 +191,8 @@ class AbstractExecutor(abc.ABC):
         state = loop.state
         matches = self.match(state, loop.matches)
         terms = self.adapt(state, matches, loop.terms)
-        used = self.problem.terms_at(state.status, terms)
-        sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, used, state.status == SETTLED)
+        acting = self.problem.terms_at(state.status, terms)
+        sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, acting, state.status == SETTLED)
         # The sums are not an output of the compiled update, which would copy them.
         return LoopResult(self.update(state, sums)._replace(sums=sums), matches, terms, loop.history)
 

@@ -122,15 +122,10 @@ class HostExecutor(AbstractExecutor):
     def scores(self, motion: Motion, matches: Matches, *arguments: Any) -> Scores:
         applied = self._over(scores_of, motion, matches, arguments, self.problem.source.observed)
         parts: list[Scores] = [jax.tree.map(np.asarray, part) for part in applied.sums(self._num_threads, packed=False)]
-        jacobian, bias = (
-            np.sum([getattr(part, name).astype(np.float64) for part in parts], axis=0) for name in ("jacobian", "bias")
-        )
         # Rows that pad the last block have no matches; their scores are 0.
-        wrenches, valid, cells = (
-            None if getattr(parts[0], name) is None else np.concatenate([getattr(part, name) for part in parts])
-            for name in ("wrenches", "valid", "cells")
-        )
-        return Scores(wrenches, valid, cells, jacobian, bias)
+        rows = jax.tree.map(lambda *blocks: np.concatenate(blocks), *(part[:3] for part in parts))
+        sums = jax.tree.map(lambda *blocks: np.sum(blocks, axis=0, dtype=np.float64), *(part[3:] for part in parts))
+        return Scores(*rows, *sums)
 
 
 @partial(quickly_compiled, level=1)

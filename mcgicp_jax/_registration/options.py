@@ -114,7 +114,7 @@ class GivenOptions(TypedDict, total=False):
 def options_of(function: Callable[..., Any], given: Any) -> Options:
     """The options of `register` given to another function; raises `TypeError` for a name that neither function has."""
     parameters = inspect.signature(function).parameters.values()
-    named = [each.name for each in parameters if each.kind is not inspect.Parameter.VAR_KEYWORD]
+    named = [parameter.name for parameter in parameters if parameter.kind is not inspect.Parameter.VAR_KEYWORD]
     names = list(dict.fromkeys([*GivenOptions.__annotations__, *named]))
     for name in given.keys() - names:
         close = difflib.get_close_matches(name, names)

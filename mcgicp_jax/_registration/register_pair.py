@@ -120,10 +120,10 @@ def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> Regist
     if not is_concrete(values, numbers):
         # Inside `jit` or `vmap`, whose tracers have no values.
         ended = run(given, *arguments, traced=True)
-        used = ended.problem.source.search.valid
-        assessment = assess(ended.loop, jax.lax.stop_gradient(ended.problem), ended.search)
-        state = differentiable(ended.loop, ended.problem, ended.search)
-        return registration_of(state, assessment, ended.loop.history, *given[:2], used, inputs=given)
+        loop, problem, search = ended.loop, ended.problem, ended.search
+        state = differentiable(loop, problem, search)
+        assessment = assess(loop, jax.lax.stop_gradient(problem), search)
+        return registration_of(state, assessment, loop.history, *given[:2], problem.source.search.valid, inputs=given)
     # Inside `grad` or `jvp`: the values are registered, and `results_of` adds the derivative. In a thread, since calls
     # of programs take longer inside transformations.
     ended = run(given, *arguments) if is_concrete(given) else in_new_thread(partial(run, values, *arguments))
@@ -249,9 +249,9 @@ def results_of(runs: Sequence[Run], givens: Sequence[Inputs]) -> list[Registrati
         # Cells, whose origin may differ, are made of concrete clouds alone: a traced origin is that of the argument.
         traces_origins = not is_concrete(given.source.origin, given.target.origin)
         source, target = (given if traces_origins else run.inputs)[:2]
-        used, executor = run.problem.source.search.valid, cast(HostExecutor, run.executor)
+        matchable, executor = run.problem.source.search.valid, cast(HostExecutor, run.executor)
         jacobian_by = partial(jacobian, run.inputs, executor, run.loop)
-        ended = state, assessment_of(executor, run.loop), run.loop.history, source, target, used, jacobian_by
+        ended = state, assessment_of(executor, run.loop), run.loop.history, source, target, matchable, jacobian_by
         results.append(registration_of(*ended, given))
     return results
 
@@ -390,10 +390,10 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
     return runs[best], reason
 
 
-def _equalized(given: Inputs, matches: Correspondences | None = None) -> Inputs:
-    check_channels(given.source, given.target, given.method)
-    source, gains = with_channels_matched(given.source, given.target, matches)
-    return given._replace(source=source, gains=gains if given.gains is None else given.gains * gains)
+def _equalized(inputs: Inputs, matches: Correspondences | None = None) -> Inputs:
+    check_channels(*inputs[:3])
+    source, gains = with_channels_matched(*inputs[:2], matches)
+    return inputs._replace(source=source, gains=gains if inputs.gains is None else inputs.gains * gains)
 
 
 def _final_pose(run: Run) -> Pose:

@@ -74,10 +74,10 @@ class TracedExecutor(AbstractExecutor):
         taken = jnp.arange(source.valid.size) % settings.stride(status, state.num_iterations) == 0
         source = source._replace(valid=source.valid & taken)
         if any(term.by_position for term in problem.terms):
-            source, target = (_without_descriptors(status != COARSE, each) for each in (source, target))
+            source, target = (_without_descriptors(status != COARSE, side) for side in (source, target))
         limit, pose = settings.max_distance, state.pose.wxyz_xyz
-        found = self._search.nearest_traced(pose, source, target, limit, running, problem.num_candidates)
-        matches = Matches.of(source, target, found, settings.distance(status))
+        indices = self._search.nearest_traced(pose, source, target, limit, running, problem.num_candidates)
+        matches = Matches.of(source, target, indices, settings.distance(status))
         return matches._replace(indices=jnp.where(running, matches.indices, before.indices))
 
     def nearest(
