@@ -24,12 +24,7 @@ from mcgicp_jax._compute.linear_maps import AbstractLinearMap, SideBySide, prima
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._compute.row_functions import Input, RowFunction, Rows, blockwise
 from mcgicp_jax._compute.threads import with_settings_of_package
-from mcgicp_jax._math.poses import (
-    parameters_by_twist,
-    rotation_from_quaternion,
-    translation_adjoint,
-    turn_by_quaternion,
-)
+from mcgicp_jax._math.poses import parameters_by_twist, translation_adjoint, turn_by_quaternion
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod, with_unset_from
 from mcgicp_jax._methods.surfaces import differentiable_inputs
@@ -175,7 +170,7 @@ class PoseDerivative(AbstractLinearMap):
 
     def _motion_by_twist(self, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "12 6"]:
         """Derivative of rotation matrix and translation by the same twist."""
-        rotation = rotation_from_quaternion(pose[:4].astype(np.float64))
+        rotation = Motion.of(pose.astype(np.float64)).rotation
         slope = np.zeros((12, 6))
         slope[:9, 3:] = np.cross(np.eye(3)[:, :, None], rotation[None], axis=1).reshape(3, 9).T
         slope[9:] = self._by_twist(pose)[4:]
