@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
+from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from mcgicp_jax._registration.tie_points_and_prior import checked_measurements
 from mcgicp_jax.extend import symmetric_matrices as alg
@@ -75,7 +76,7 @@ def test_the_form_is_the_cost(kind):
     nothing = np.zeros((6, 6))
     fusion = Fusion(start[:3, :3], start[:3, 3], center, radius, form, np.eye(6), nothing, nothing, np.ones(6, bool))
     with jax.enable_x64(True):
-        force, stiffness = jax.jit(Fusion.force_and_stiffness)(fusion, pose[:3, :3], pose[:3, 3])
+        force, stiffness = jax.jit(Fusion.force_and_stiffness)(fusion, Motion(pose[:3, :3], pose[:3, 3]))
     np.testing.assert_allclose(force, -slope.T @ residuals(np.zeros(6)), rtol=1e-6)
     np.testing.assert_allclose(stiffness, slope.T @ slope, rtol=1e-6)
 

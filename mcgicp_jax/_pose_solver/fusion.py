@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from mcgicp_jax._math.poses import adjoint_to_source, translation_adjoint, units
 from mcgicp_jax._pose_solver.covariance import UNKNOWN, Moments, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import Directions
+from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm, PoseMeasurements
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import Update, twist_form, wrench
@@ -33,13 +34,12 @@ def constrained_by_pose_form(directions: Directions, information: Float[Array, "
     # −1 and −2 sort the other directions first.
     values, turn = jnp.linalg.eigh(stiffness / scale + jnp.diag(-1.0 * ~free - fixed))
     squares = turn.T**2
-    return Directions(
+    return replace(
+        directions,
         twists=(basis @ turn).T,
         geometry=squares @ directions.geometry,
         channels=squares @ directions.channels,
         ties=jnp.where(values < -1.5, jnp.inf, jnp.where(values < -0.5, 0, values * scale)),
-        center=directions.center,
-        radius=directions.radius,
     )
 
 
@@ -50,12 +50,9 @@ def fuse(
     """The equation of the pose from the end of a first registration, see `register`: its pose and `Sums.center`, to
     which `form` refers, its directions as in the loop, and the moments of its scores."""
     radius = jnp.asarray(directions.radius)
-    rotation, translation = pose.rotation().as_matrix().astype(radius.dtype), pose.translation()
-    nothing, identity = jnp.zeros((6, 6), radius.dtype), jnp.eye(6, dtype=radius.dtype)
-    fusion = Fusion(
-        rotation, translation, center, radius, form, identity, nothing, nothing, directions.constrained_by_matches
-    )
-    directions = constrained_by_pose_form(directions, fusion.force_and_stiffness(rotation, translation)[1])
+    motion = Motion.of(pose.wxyz_xyz)
+    measurements = PoseMeasurements(*motion, center, radius, form)
+    directions = constrained_by_pose_form(directions, measurements.force_and_stiffness(motion)[1])
     basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.constrained_by_matches)
     both, others = jnp.outer(by_matches, by_matches), jnp.diag(1.0 * ~by_matches)
     response, scatter = response_and_scatter(moments, radius)
@@ -68,10 +65,8 @@ def fuse(
     information = 0.5 * (information + information.T)
     fixed = None
     if form.prior.fixed is not None:
-        basis, fixed = fusion.prior_residual(rotation, translation)[1].T @ basis, directions.fixed
-    return replace(
-        fusion, basis=basis, gain=gain, information=information, constrained=directions.constrained, fixed=fixed
-    )
+        basis, fixed = measurements.prior_residual(motion)[1].T @ basis, directions.fixed
+    return Fusion(*motion, center, radius, form, basis, gain, information, directions.constrained, fixed)
 
 
 def _to_sums(fusion: PoseMeasurements, sums: Sums) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
@@ -91,8 +86,7 @@ def first_force(
     `_FIRST_STIFFNESS` (λ / (1 + λ))⁸ times that of the matches, along the directions that these constrain. So the pose
     at which the weights of a `Fusion` are estimated depends on those alone that are far more precise than the matches.
     """
-    rotation = pose.rotation().as_matrix().astype(sums.center.dtype)
-    force, stiffness = measurements.force_and_stiffness(rotation, pose.translation())
+    force, stiffness = measurements.force_and_stiffness(Motion.of(pose.wxyz_xyz))
     _, back = _to_sums(measurements, sums)
     basis, constrained = jnp.asarray(directions.twists).T, jnp.asarray(directions.constrained_by_matches)
     along, weight = back @ basis, _FIRST_WEIGHT * sums.cost / jnp.maximum(sums.count, 1) / sums.radius**2
@@ -110,9 +104,8 @@ def first_force(
 
 def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: Fusion) -> tuple[Directions, Update]:
     """One Newton step on P s + γ = 0, with the matches and M fixed; and the directions with tie points and prior."""
-    radius, dtype = fusion.radius, sums.center.dtype
-    rotation = pose.rotation().as_matrix().astype(dtype)
-    pose_force, pose_stiffness = fusion.force_and_stiffness(rotation, pose.translation())
+    radius, motion = fusion.radius, Motion.of(pose.wxyz_xyz)
+    pose_force, pose_stiffness = fusion.force_and_stiffness(motion)
     outwards, back = _to_sums(fusion, sums)
     centred_stiffness = back.T @ pose_stiffness @ back
     directions = constrained_by_pose_form(directions, centred_stiffness)
@@ -122,8 +115,8 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     score = outwards.T @ wrench(sums.force, sums.radius) * ratio
     stiffness = outwards.T @ (unit_information * sums.radius**2) @ outwards / radius
     # The solution waits for the eigenvectors of the directions: two batched LAPACK calls at once can deadlock.
-    rotation, _ = jax.lax.optimization_barrier((rotation, directions.twists))
-    basis, free = fusion.twists_at(rotation, pose.translation()), fusion.free
+    rotation, _ = jax.lax.optimization_barrier((motion.rotation, directions.twists))
+    basis, free = fusion.twists_at(motion._replace(rotation=rotation)), fusion.free
     slope = fusion.gain @ basis.T @ stiffness @ basis + basis.T @ pose_stiffness @ basis
     force = fusion.gain @ (basis.T @ score) + basis.T @ pose_force
     slope = jnp.where(jnp.outer(free, free), slope, jnp.diag(1.0 * ~free))
@@ -142,9 +135,9 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
 @jax.jit
 def fused_covariance(pose: jaxlie.SE3, fusion: Fusion) -> Float[Array, "6 6"]:
     """Covariance of the pose, for ξ in T exp(ξ), metres and radians."""
-    rotation = pose.rotation().as_matrix().astype(fusion.basis.dtype)
-    _, stiffness = fusion.force_and_stiffness(rotation, pose.translation())
-    basis = fusion.twists_at(rotation, pose.translation())
+    motion = Motion.of(pose.wxyz_xyz)
+    _, stiffness = fusion.force_and_stiffness(motion)
+    basis = fusion.twists_at(motion)
     total = fusion.information + basis.T @ stiffness @ basis + jnp.diag(~fusion.constrained / UNKNOWN**2)
     change = adjoint_to_source(pose, fusion.center) * units(fusion.radius) @ basis
     if fusion.fixed is not None:

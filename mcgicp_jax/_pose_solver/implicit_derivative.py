@@ -173,10 +173,11 @@ def value_and_jacobian(
 
 
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
-    """`score_at`, or `Fusion.balance`, at a pose moved to first order along a twist (in units of the radius)."""
+    """`score_at`, or `Fusion.balance`, at a pose `moved_along` a twist."""
     matched, terms, fusion = model
-    score = score_at(_moved(twist, pose, root), root, matched, terms)
-    return score if fusion is None else balance_along(twist, pose, root, score, fusion)
+    motion = moved_along(twist, pose, root)
+    score = score_at(motion, root, matched, terms)
+    return score if fusion is None else fusion.balance(score, motion)
 
 
 def score_at(
@@ -191,15 +192,8 @@ def score_at(
     return jnp.concatenate([jnp.sum(found.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
 
 
-def balance_along(
-    twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, score: Float[Array, "6"], fusion: Fusion
-) -> Float[Array, "6"]:
-    """`Fusion.balance` at a pose moved to first order along a twist, from the score there."""
-    motion = _moved(twist, pose, root)
-    return fusion.balance(score, jnp.asarray(motion.rotation), jnp.asarray(motion.translation))
-
-
-def _moved(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot) -> Motion:
+def moved_along(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot) -> Motion:
+    """The pose moved to first order along a twist (in units of the radius)."""
     rotation = jaxlie.SO3(pose[:4]).as_matrix().astype(pose.dtype)
     v, omega = twist[:3] * root.radius, twist[3:]
     turned = rotation + jnp.cross(omega[:, None], rotation, axis=0)

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._math.poses import adjoint_to_source, translation_adjoint, units
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
+from mcgicp_jax._pose_solver.matched import Motion
 
 
 class TiePoints(NamedTuple):
@@ -104,22 +105,18 @@ class PoseMeasurements(eqx.Module):
     radius: Float[AnyScalar, ""]
     form: PoseForm
 
-    def _change(
-        self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
-    ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    def _change(self, motion: Motion) -> Motion:
         """ΔR and Δt of a pose, metres."""
-        turn = rotation @ self.rotation.T
-        return turn, translation - self.center - turn @ (self.translation - self.center)
+        turn = motion.rotation @ self.rotation.T
+        return Motion(turn, motion.translation - self.center - turn @ (self.translation - self.center))
 
-    def prior_residual(
-        self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
-    ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    def prior_residual(self, motion: Motion) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """ξ at a pose, and its derivative by each of six twists, one per row."""
-        _, shift = self._change(rotation, translation)
+        shift = self._change(motion).translation
         prior, dtype = self.form.prior, shift.dtype
 
         def residual_at(twist: Float[Array, "6"]) -> Float[Array, "6"]:
-            turned = rotation + jnp.cross(twist[3:, None], rotation, axis=0)
+            turned = motion.rotation + jnp.cross(twist[3:, None], motion.rotation, axis=0)
             moved = (shift + jnp.cross(twist[3:], shift)) / self.radius + twist[:3]
             error = jaxlie.SE3.from_rotation_and_translation(
                 jaxlie.SO3.from_matrix(prior.rotation.T @ turned), prior.rotation.T @ (moved - prior.translation)
@@ -129,11 +126,9 @@ class PoseMeasurements(eqx.Module):
         residual, jvp = jax.linearize(residual_at, jnp.zeros(6, dtype))
         return residual, jax.vmap(jvp)(jnp.eye(6, dtype=dtype))
 
-    def force_and_stiffness(
-        self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
-    ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
+    def force_and_stiffness(self, motion: Motion) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """γ, and its stiffness JᵀQJ, at a pose."""
-        turn, shift = self._change(rotation, translation)
+        turn, shift = self._change(motion)
         now = jnp.concatenate([turn, shift[:, None] / self.radius], axis=1)
         axes = jnp.eye(3, dtype=now.dtype)
         along = jnp.concatenate([jnp.zeros((3, 3, 3), now.dtype), axes[:, :, None]], axis=2)
@@ -141,7 +136,7 @@ class PoseMeasurements(eqx.Module):
         slope = jnp.concatenate([along, about]).reshape(6, 12)
         change = (now - jnp.eye(3, 4, dtype=now.dtype)).reshape(12)
         prior = self.form.prior
-        residual, rows = self.prior_residual(rotation, translation)
+        residual, rows = self.prior_residual(motion)
         force = slope @ (self.form.force - self.form.stiffness @ change) - rows @ prior.information @ residual
         return force, slope @ self.form.stiffness @ slope.T + rows @ prior.information @ rows.T
 
@@ -176,21 +171,19 @@ class Fusion(PoseMeasurements):
         """Which twists of the basis tie points, prior and matches determine together."""
         return self.constrained if self.fixed is None else self.constrained & ~self.fixed
 
-    def twists_at(self, rotation: Float[Array, "3 3"], translation: Float[Array, "3"]) -> Float[AnyArray, "6 6"]:
+    def twists_at(self, motion: Motion) -> Float[AnyArray, "6 6"]:
         if self.fixed is None:
             return self.basis
-        return jnp.linalg.solve(self.prior_residual(rotation, translation)[1].T, self.basis)
+        return jnp.linalg.solve(self.prior_residual(motion)[1].T, self.basis)
 
-    def balance(
-        self, score: Float[Array, "6"], rotation: Float[Array, "3 3"], translation: Float[Array, "3"]
-    ) -> Float[Array, "6"]:
+    def balance(self, score: Float[Array, "6"], motion: Motion) -> Float[Array, "6"]:
         """P s + γ, in the basis; F ξ instead for fixed directions."""
-        force, _ = self.force_and_stiffness(rotation, translation)
-        basis, fixed = self.twists_at(rotation, translation), self.form.prior.fixed
+        force, _ = self.force_and_stiffness(motion)
+        basis, fixed = self.twists_at(motion), self.form.prior.fixed
         forces = self.gain @ (basis.T @ score) + basis.T @ force
         if self.fixed is None or fixed is None:
             return forces
-        residual, _ = self.prior_residual(rotation, translation)
+        residual, _ = self.prior_residual(motion)
         return jnp.where(self.fixed, (fixed @ self.basis).T @ (fixed @ residual), forces)
 
 

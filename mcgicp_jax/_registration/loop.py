@@ -380,7 +380,7 @@ def squares_from_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) 
     if not isinstance(measurements, Fusion):
         return np.float32(0)
     rotation = pose.rotation().as_matrix().astype(measurements.center.dtype)
-    residual, _ = measurements.prior_residual(rotation, pose.translation())
+    residual, _ = measurements.prior_residual(Motion(rotation, pose.translation()))
     return residual @ measurements.form.prior.information @ residual
 
 
@@ -389,8 +389,7 @@ def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     converged = (state.status == Status.CONVERGED) | (state.status == Status.UNVERIFIED)
     usable = converged | (state.status == Status.DEGENERATE) | (state.status == Status.MAX_ITERATIONS)
     if fusion is not None:
-        rotation = state.pose.rotation().as_matrix().astype(state.sums.center.dtype)
-        basis, constrained = fusion.twists_at(rotation, state.pose.translation()), fusion.constrained
+        basis, constrained = fusion.twists_at(Motion.of(state.pose.wxyz_xyz)), fusion.constrained
     elif state.directions is not None:
         basis, constrained = jnp.asarray(state.directions.twists).T, state.directions.constrained
     else:

@@ -31,7 +31,7 @@ from mcgicp_jax._methods.surfaces import differentiable_inputs
 from mcgicp_jax._pose_solver.implicit_derivative import (
     MAX_NEWTON_STEPS,
     ImplicitRoot,
-    balance_along,
+    moved_along,
     score_at,
     value_and_jacobian,
 )
@@ -189,7 +189,7 @@ def _balance_and_slope(
     """The equation with tie points and a prior, and its derivative by a twist, from those of the matches, g first."""
 
     def balance(twist: Float[Array, "6"]) -> Float[Array, "6"]:
-        return balance_along(twist, pose, root, matches[:, 0] + matches[:, 1:] @ twist, fusion)
+        return fusion.balance(matches[:, 0] + matches[:, 1:] @ twist, moved_along(twist, pose, root))
 
     value, slope = value_and_jacobian(balance, jnp.zeros_like(pose[:6]))
     return jnp.concatenate([value[:, None], slope], axis=1)
@@ -204,8 +204,8 @@ def _vjp_of_balance(
     cotangents: Float[Array, "m 6"],
 ) -> tuple[Float[Array, "m 6"], PoseForm]:
     def balance(score: Float[Array, "6"], form: PoseForm) -> Float[Array, "6"]:
-        nowhere = jnp.zeros_like(score)
-        return balance_along(nowhere, pose, root, score, eqx.tree_at(lambda fusion: fusion.form, fusion, form))
+        motion = moved_along(jnp.zeros_like(score), pose, root)
+        return eqx.tree_at(lambda fusion: fusion.form, fusion, form).balance(score, motion)
 
     _, vjp = jax.vjp(balance, score, fusion.form)
     return jax.vmap(vjp)(cotangents)
