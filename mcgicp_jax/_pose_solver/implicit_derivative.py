@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -99,6 +100,7 @@ def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -
     return pose
 
 
+@partial(with_derivative.defjvp, symbolic_zeros=True)
 @with_settings_of_package
 def _with_derivative_jvp(
     primals: tuple[Float[Array, "7"], ImplicitRoot, Model], tangents: tuple[Any, Any, Any]
@@ -110,21 +112,17 @@ def _with_derivative_jvp(
     if not moving:
         return pose, jnp.zeros_like(pose)
     leaves = [once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
-    constants = jax.lax.stop_gradient((pose, root, leaves))
-    at_root, inverse = _newton(constants[0], constants[1], jax.tree.unflatten(structure, constants[2]))
+    start, root, constants = jax.lax.stop_gradient((pose, root, leaves))
+    at_root, inverse = _newton(start, root, jax.tree.unflatten(structure, constants))
 
     def balance_of(values: list[Array]) -> Float[Array, "6"]:
-        changed = list(constants[2])
+        changed = list(constants)
         for i, value in zip(moving, values, strict=True):
             changed[i] = value
-        return _balance(jnp.zeros_like(at_root[:6]), at_root, constants[1], jax.tree.unflatten(structure, changed))
+        return _balance(jnp.zeros_like(at_root[:6]), at_root, root, jax.tree.unflatten(structure, changed))
 
     _, change = jax.jvp(balance_of, ([leaves[i] for i in moving],), ([slopes[i] for i in moving],))
-    twist = -inverse @ change * units(constants[1].radius)
-    return pose, _along(constants[0], twist, constants[1].center)
-
-
-with_derivative.defjvp(_with_derivative_jvp, symbolic_zeros=True)
+    return pose, _along(start, -inverse @ change * units(root.radius), root.center)
 
 
 def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:
@@ -159,8 +157,8 @@ def _newton(
         # Convergence is quadratic: after a step below √eps the remaining error is rounding.
         return (count < MAX_NEWTON_STEPS) & ~(size <= small)
 
-    first = jnp.int32(0), start, identity, jnp.asarray(jnp.inf, start.dtype)
-    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, first)
+    before = jnp.int32(0), start, identity, jnp.asarray(jnp.inf, start.dtype)
+    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, before)
     return at_root, jnp.where(root.usable & (size <= small), inverse, 0)
 
 
@@ -186,10 +184,10 @@ def score_at(
     """g / scale, sums of forces and torques."""
     # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
     matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
-    posed, found, _ = linearize_at(motion, matched, terms)
+    posed, total, _ = linearize_at(motion, matched, terms)
     arms = jnp.where(matched.valid, posed.moved - root.center[:, None], 0)
-    torque = jnp.cross(arms, found.force, axis=0)
-    return jnp.concatenate([jnp.sum(found.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
+    torque = jnp.cross(arms, total.force, axis=0)
+    return jnp.concatenate([jnp.sum(total.force, axis=1) * root.radius, jnp.sum(torque, axis=1)]) / root.scale
 
 
 def moved_along(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot) -> Motion:

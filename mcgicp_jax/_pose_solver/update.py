@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
@@ -22,21 +23,8 @@ _HESSIAN_SCALE = 1e4
 _MAX_STEPS = 32
 # Stored entry of each row and column of the symmetric 3×3 matrices.
 _SYMMETRIC = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
-# (12, 6) derivative at the identity of vec D by ξ = (v, ω): D = [ω× | v], flattened row by row.
-_TANGENT = (
-    (0, 0, 0, 0, 0, 0),
-    (0, 0, 0, 0, 0, -1),
-    (0, 0, 0, 0, 1, 0),
-    (1, 0, 0, 0, 0, 0),
-    (0, 0, 0, 0, 0, 1),
-    (0, 0, 0, 0, 0, 0),
-    (0, 0, 0, -1, 0, 0),
-    (0, 1, 0, 0, 0, 0),
-    (0, 0, 0, 0, -1, 0),
-    (0, 0, 0, 1, 0, 0),
-    (0, 0, 0, 0, 0, 0),
-    (0, 0, 1, 0, 0, 0),
-)
+# (12, 6) derivative at the identity of vec D by ξ = (v, ω): D = [ω× | v], flattened row by row; + 0.0 turns −0 into 0.
+_TANGENT = np.concatenate([skew(np.eye(6)[:, 3:]), np.eye(6)[:, :3, None]], axis=2).reshape(6, 12).T + 0.0
 
 
 class Update(eqx.Module):
