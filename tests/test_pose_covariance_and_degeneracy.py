@@ -387,7 +387,8 @@ def test_geometry_and_channels_have_discounts_of_their_own(monkeypatch):
     np.testing.assert_allclose(discount, [0.4, 0.7], rtol=0.02)
     information = rng.random((6, 5))
     trace = information[[0, 3, 5]].sum(axis=0)
-    monkeypatch.setattr(covariance, "observability", lambda *_: [information, information / (1 + trace)])
+    fractions = {"observability": information, "channel_observability": information / (1 + trace)}
+    monkeypatch.setattr(covariance, "observability", lambda *_: fractions)
     posed = PosedMatches._make([None] * len(PosedMatches._fields))
     shown = covariance._discounted_observability(posed, jnp.array([0.4, 0.7]), ())
     np.testing.assert_allclose(shown, 0.4 * information + 0.7 * information / (1 + 0.7 * trace), rtol=1e-5)

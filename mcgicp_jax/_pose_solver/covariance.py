@@ -186,14 +186,16 @@ def scores_of(
 def _discounted_observability(
     posed: PosedMatches, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6 n"]:
-    geometry, *channels = observability(posed, terms, np.bool_(True))
-    shown = discount[0] * geometry
-    if channels:
+    fractions = observability(posed, terms, np.bool_(True))
+    shown = discount[0] * fractions["observability"]
+    channels = fractions.get("channel_observability")
+    if channels is not None:
         # Their agreement is unbiased only for matches that are nearest in position.
-        each = channels[min(1, len(channels) - 1) if all(term.by_position for term in terms) else 0]
+        if all(term.by_position for term in terms):
+            channels = fractions.get("agreement", channels)
         # A / (1 + tr A) with A multiplied by the discount.
-        trace = each[0] + each[3] + each[5]
-        shown = shown + discount[1] * each / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
+        trace = channels[0] + channels[3] + channels[5]
+        shown = shown + discount[1] * channels / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
     return shown
 
 
@@ -253,8 +255,7 @@ def moments_from(scores: Scores, num_cells: int) -> Moments:
         rows = jnp.zeros_like(rows, shape=(num_cells, 7)).at[cells].add(rows, mode="drop")
     sums, counts = rows[:, :6], rows[:, 6]
     product = sums.T @ sums if xp is np else jnp.dot(sums.T, sums, precision="highest")
-    number = xp.sum(counts > 0)
-    return Moments(scores.jacobian, scores.bias, product, np.int32(number) if xp is np else number)
+    return Moments(scores.jacobian, scores.bias, product, xp.sum(counts > 0, dtype=np.int32))
 
 
 def response_and_scatter(moments: Moments, radius: Float[Array, ""]) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:

@@ -104,52 +104,47 @@ def sums_of(
             others say less; their channels do not count.
         last: whether the loop ends with these sums, see `observability`.
     """
-    posed, found, counts = linearize_at(motion, matched, terms)
+    posed, total, counts = linearize_at(motion, matched, terms)
     mask = jnp.asarray(matched.valid).astype(posed.moved.dtype)
-    *total, count = jnp.dot(with_one(posed.moved), mask, precision="highest")
-    center = jnp.stack(total) / jnp.maximum(count, 1)
+    *position, count = jnp.dot(with_one(posed.moved), mask, precision="highest")
+    center = jnp.stack(position) / jnp.maximum(count, 1)
     h = with_one(mask * (posed.moved - center[:, None]))
     share = _share(counts, matched.num_candidates)
-    shown = observability(posed, terms, last)
-    rows = [
-        found.stiffness,
-        found.force,
-        jnp.stack(
-            [
-                mask,
-                alg.inner(found.residual, found.force),
-                found.cost,
-                share * alg.inner(found.residual, found.residual),
-                _first_of_each(mask, matched.num_candidates),
-            ]
-        ),
+    numbers = [
+        mask,
+        alg.inner(total.residual, total.force),
+        total.cost,
+        share * alg.inner(total.residual, total.residual),
+        _first_of_each(mask, matched.num_candidates),
     ]
-    if shown:
-        square = jnp.sum(jnp.square(jnp.asarray(posed.source.points)), axis=1)
-        geometry, *channels = shown
-        far = square >= near**2
-        evidence = jnp.where(far, found.weight, 0)
-        rows += [evidence[None], jnp.where(far, found.weight, -found.weight) * geometry]
-        rows += [evidence * each for each in channels]
-    stiffness, force, numbers, *others = jnp.split(
-        moments_about(jnp.concatenate(rows), h), np.cumsum([len(row) for row in rows])[:-1]
-    )
-    _, energy, cost, square_distance, num_matched = numbers[:, 3, 3]
+    rows = {"stiffness": total.stiffness, "force": total.force, "numbers": jnp.stack(numbers)}
+    fractions = observability(posed, terms, last)
+    if fractions:
+        far = jnp.sum(jnp.square(jnp.asarray(posed.source.points)), axis=1) >= near**2
+        evidence = jnp.where(far, total.weight, 0)
+        rows["mass"] = evidence[None]
+        rows["observability"] = jnp.where(far, total.weight, -total.weight) * fractions.pop("observability")
+        rows |= {name: evidence * fraction for name, fraction in fractions.items()}
+    ends = np.cumsum([len(row) for row in rows.values()])
+    split = jnp.split(moments_about(jnp.concatenate(list(rows.values())), h), ends[:-1])
+    moments = dict(zip(rows, split, strict=True))
+    if "mass" in moments:
+        moments["mass"] = moments["mass"][0]
+    if "channel_observability" in moments:
+        moments.setdefault("agreement", moments["channel_observability"])
+        moments.setdefault("surplus", jnp.zeros_like(moments["channel_observability"]))
+    sums = moments.pop("numbers")
+    _, energy, cost, square_distance, num_matched = sums[:, 3, 3]
     return Sums(
         center=center,
         count=count,
-        square_extent=jnp.trace(numbers[0, :3, :3]),
+        square_extent=jnp.trace(sums[0, :3, :3]),
         energy=energy,
         cost=cost,
         square_distance=square_distance,
         num_matched=num_matched,
-        force=force[:, 3],
-        stiffness=stiffness,
-        mass=others[0][0] if shown else None,
-        observability=others[1] if shown else None,
-        channel_observability=others[2] if len(shown) > 1 else None,
-        agreement=others[min(3, len(shown))] if len(shown) > 1 else None,
-        surplus=others[4] if len(shown) > 2 else jnp.zeros_like(others[2]) if len(shown) > 1 else None,
+        force=moments.pop("force")[:, 3],
+        **moments,
     )
 
 
@@ -169,22 +164,22 @@ def _first_of_each(mask: Float[Array, "n"], num_candidates: int) -> Float[Array,
     """1 for the first valid candidate of each source point."""
     if num_candidates == 1:
         return mask
-    each = mask.reshape(num_candidates, -1)
-    return jnp.where(jnp.cumsum(each, axis=0) == 1, each, 0).reshape(-1)
+    by_candidate = mask.reshape(num_candidates, -1)
+    return jnp.where(jnp.cumsum(by_candidate, axis=0) == 1, by_candidate, 0).reshape(-1)
 
 
 def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
     """The weights of the candidates of each source point, divided by their sum; 0 for points without any."""
-    each = counts.reshape(num_candidates, -1)
-    total = jnp.sum(each, axis=0)
-    return (each / jnp.where(total > 0, total, 1)).reshape(-1)
+    by_candidate = counts.reshape(num_candidates, -1)
+    total = jnp.sum(by_candidate, axis=0)
+    return (by_candidate / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
 def observability(
     posed: PosedMatches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]
-) -> list[Float[Array, "6 n"]]:
-    """O per correspondence, in the target's frame: mean over its two points, by shape, and where channels are used, by
-    channels; then, if the surfaces have `noise` with slopes, by the agreement of the channels, and its surplus.
+) -> dict[str, Float[Array, "6 n"]]:
+    """O per correspondence, in the target's frame, by its name in `Sums`: mean over its two points, by shape, and where
+    channels are used, by channels; and if the surfaces have `noise` with slopes, their agreement and its surplus.
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
     cell. For cells it is therefore the product of both, whose noise is independent, less what they have in common by
@@ -193,14 +188,16 @@ def observability(
     """
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
-        return []
+        return {}
     ours, theirs = alg.rotate(rotation, source.observability.T), target.observability.T
-    found = [0.5 * (ours + theirs)]
+    fractions = {"observability": 0.5 * (ours + theirs)}
     if not all(term.matches_slide for term in terms):
         by_chance = _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
-        found = [jnp.where(last, alg.symmetric_product(ours, theirs) - by_chance, *found)]
+        common = alg.symmetric_product(ours, theirs) - by_chance
+        fractions["observability"] = jnp.where(last, common, fractions["observability"])
     if source.channel_observability is not None and target.channel_observability is not None:
-        found.append(0.5 * (alg.rotate(rotation, source.channel_observability.T) + target.channel_observability.T))
+        ours, theirs = alg.rotate(rotation, source.channel_observability.T), target.channel_observability.T
+        fractions["channel_observability"] = 0.5 * (ours + theirs)
     slopes = [None if surface.noise is None else surface.noise.slopes for surface in (source, target)]
     if target.noise is not None and slopes[0] is not None and slopes[1] is not None:
         turned = jnp.einsum("ij,ncj->cin", rotation, slopes[0], precision="highest")
@@ -208,8 +205,9 @@ def observability(
         sight = jnp.dot(rotation, source.points.T, precision="highest")
         tangent = jnp.cross(target.noise.normal.T, sight, axis=0)
         length = jnp.sqrt(alg.inner(tangent, tangent))
-        found += agreement(turned, slopes[1].transpose(1, 2, 0), tangent / jnp.where(length > 0, length, 1))
-    return found
+        across = tangent / jnp.where(length > 0, length, 1)
+        fractions["agreement"], fractions["surplus"] = agreement(turned, slopes[1].transpose(1, 2, 0), across)
+    return fractions
 
 
 def combine(parts: Sums) -> Sums:
@@ -218,24 +216,16 @@ def combine(parts: Sums) -> Sums:
     # Non-finite values propagate into the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(invalid="ignore", over="ignore"):
         center = parts.count @ parts.center / max(parts.count.sum(), 1)
-        parts = _about(center, parts)
-        added = {name: None if each is None else each.sum(axis=0) for name, each in parts._asdict().items()}
-        return Sums(**added | {"center": center})
-
-
-def _about(center: Float[np.ndarray, "3"], parts: Sums) -> Sums:
-    offset = parts.center - center
-    shift = np.zeros((len(offset), 4, 4)) + np.eye(4)
-    shift[:, :3, 3] = offset
-
-    # All sums over h hᵀ at once.
-    names = [name for name in _SECOND_MOMENTS if getattr(parts, name) is not None]
-    rows = [getattr(parts, name).reshape(len(offset), -1, 4, 4) for name in names]
-    sums = shift[:, None] @ np.concatenate(rows, axis=1) @ shift[:, None].swapaxes(-1, -2)
-    moved = np.split(sums, np.cumsum([each.shape[1] for each in rows])[:-1], axis=1)
-    shaped = {name: each.reshape(getattr(parts, name).shape) for name, each in zip(names, moved, strict=True)}
-    return parts._replace(
-        square_extent=parts.square_extent + parts.count * np.sum(offset * offset, axis=1),
-        force=parts.force @ shift.swapaxes(-1, -2),
-        **shaped,
-    )
+        offset = parts.center - center
+        shift = np.zeros((len(offset), 4, 4)) + np.eye(4)
+        shift[:, :3, 3] = offset
+        columns = {name: column for name, column in parts._asdict().items() if column is not None}
+        columns["square_extent"] = parts.square_extent + parts.count * np.sum(offset * offset, axis=1)
+        columns["force"] = parts.force @ shift.swapaxes(-1, -2)
+        # All sums over h hᵀ at once.
+        names = [name for name in _SECOND_MOMENTS if name in columns]
+        rows = [columns[name].reshape(len(offset), -1, 4, 4) for name in names]
+        moved = shift[:, None] @ np.concatenate(rows, axis=1) @ shift[:, None].swapaxes(-1, -2)
+        parts_moved = np.split(moved, np.cumsum([part.shape[1] for part in rows])[:-1], axis=1)
+        columns |= {name: part.reshape(columns[name].shape) for name, part in zip(names, parts_moved, strict=True)}
+        return Sums(**{name: column.sum(axis=0) for name, column in columns.items()} | {"center": center})
