@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import Input, Rows, whole
-from mcgicp_jax._local_geometry.local_geometry import Surface
+from mcgicp_jax._local_geometry.local_geometry import Surface, SurfaceNoise
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import rotated, rotation_from_quaternion
 from mcgicp_jax._math.statistics import sampled_rows
@@ -70,8 +70,8 @@ class Matches(NamedTuple):
     ) -> Matches:
         """Matches found by a search, without those of padding."""
         xp = numpy_for(source, target, indices)
-        found = (indices >= 0) & source.valid & xp.asarray(target.valid)[xp.maximum(indices, 0)]
-        return Matches(xp.where(found, indices, -1), max_distance, rows)
+        valid = (indices >= 0) & source.valid & xp.asarray(target.valid)[xp.maximum(indices, 0)]
+        return Matches(xp.where(valid, indices, -1), max_distance, rows)
 
     @staticmethod
     def given(matches: Correspondences, temperature: Any = None) -> Matches:
@@ -91,7 +91,8 @@ class Matched(eqx.Module):
     Attributes:
         source, target: rows of the surfaces; the first candidates of all source points come first.
         valid: (n,) False for correspondences to ignore.
-        descriptor_distances: (n,) squared distances of descriptors α · channel, metres²; only for soft assignment.
+        descriptor_distances: (n,) squared distances of descriptors α · channel, with the penalties for missing
+            channels, metres²; only for soft assignment.
         temperature: of the soft assignment, metres; None otherwise.
         num_candidates: m.
     """
@@ -107,9 +108,9 @@ class Matched(eqx.Module):
         moved = motion.move(self.source.points)
         return PosedMatches(self.source, self.target, moved, motion.rotation, self.valid)
 
-    def within(self, moved: Float[Array, "3 n"], max_distance: Float[Array, ""]) -> Matched:
-        """The matches within `max_distance` metres; `moved` is T a."""
-        _, near = distances_within(moved, self.target.points, max_distance)
+    def within(self, motion: Motion, max_distance: Float[Array, ""]) -> Matched:
+        """The matches within `max_distance` metres at a pose."""
+        _, near = distances_within(motion.move(self.source.points), self.target.points, max_distance)
         return eqx.tree_at(lambda matched: matched.valid, self, self.valid & near)
 
 
@@ -117,11 +118,11 @@ def match_surfaces(source: Surface, target: Surface, matches: Matches) -> Matche
     """Gather the matched rows of both surfaces, for their derivative; pure JAX."""
     # Points without a match are filled with the rows of other matches in turn, see `whole`.
     indices = jnp.asarray(matches.indices).reshape(-1)
-    (found,) = jnp.nonzero(indices >= 0, size=indices.size)
-    others = indices[found[jnp.arange(indices.size) % jnp.maximum(jnp.sum(indices >= 0), 1)]]
+    (matched,) = jnp.nonzero(indices >= 0, size=indices.size)
+    others = indices[matched[jnp.arange(indices.size) % jnp.maximum(jnp.sum(indices >= 0), 1)]]
     filled = jnp.where(indices >= 0, indices, others).reshape(matches.indices.shape)
-    rows = [whole(each) for each in inputs_of(source, target, matches._replace(indices=filled))]
-    rows[1::2] = [each._replace(index=matches.indices) for each in rows[1::2]]
+    rows = list(map(whole, inputs_of(source, target, matches._replace(indices=filled))))
+    rows[1::2] = [part._replace(index=matches.indices) for part in rows[1::2]]
     return matched_rows(rows, matches.temperature)
 
 
@@ -136,42 +137,43 @@ def inputs_of(
 
 
 @cache
-def of_matches(function: Callable[..., Any], with_noise: bool, total: bool = True) -> Callable[..., Any]:
+def of_matches(function: Callable[..., Any], total: bool = True) -> Callable[..., Any]:
     """A function of a motion, `Matched` and others as a row function of `inputs_of`: a sum, or one tree of rows."""
 
     def of_rows(numbers: tuple[Motion, Any, Any, tuple[Any, ...]], *rows: Rows) -> Any:
         motion, max_distance, temperature, arguments = numbers
-        matched = matched_rows(rows, temperature, with_noise)
-        result = function(motion, matched.within(motion.move(matched.source.points), max_distance), *arguments)
+        result = function(motion, matched_rows(rows, temperature).within(motion, max_distance), *arguments)
         return result if total else (result,)
 
     of_rows.__name__ = function.__name__
     return of_rows
 
 
-def matched_rows(
-    rows: Sequence[Rows], temperature: Float[AnyScalar, ""] | None = None, with_noise: bool = False
-) -> Matched:
+def matched_rows(rows: Sequence[Rows], temperature: Float[AnyScalar, ""] | None = None) -> Matched:
     """Matches from rows gathered from `inputs_of`; the index in the target is −1 for correspondences to ignore."""
-    target = rows[1]
-    count = len(target.index) if target.index.ndim == 2 else 1
+    index = rows[1].index
+    count = len(index) if index.ndim == 2 else 1
 
     def tiled(tree: Any) -> Any:
         return jax.tree.map(lambda rows: jnp.tile(rows, (count, *[1] * (rows.ndim - 1))), tree)
 
     def flat(tree: Any) -> Any:
-        return jax.tree.map(lambda rows: rows.reshape(target.index.size, *rows.shape[target.index.ndim :]), tree)
+        return jax.tree.map(lambda rows: rows.reshape(index.size, *rows.shape[index.ndim :]), tree)
 
-    sources, targets = [tiled(each.tree) for each in rows[::2]], [flat(each.tree) for each in rows[1::2]]
-    surfaces = sources[0], targets[0]
-    if with_noise:
-        surfaces = surfaces[0]._replace(noise=sources[1]), surfaces[1]._replace(noise=targets[1])
+    sides = [tiled(part.tree) for part in rows[::2]], [flat(part.tree) for part in rows[1::2]]
+    source, target = (
+        surface._replace(**{"noise" if isinstance(part, SurfaceNoise) else "search": part for part in parts})
+        for surface, *parts in sides
+    )
     descriptor_distances = None
     if temperature is not None:
-        descriptor_distances = _squared_descriptor_distances(sources[-1], targets[-1])
-    elif len(sources) > 1 + with_noise:
-        surfaces = surfaces[0]._replace(search=sources[-1]), surfaces[1]._replace(search=targets[-1])
-    return Matched(*surfaces, target.index.reshape(-1) >= 0, descriptor_distances, temperature, count)
+        square = (source.search.descriptors - target.search.descriptors) ** 2
+        for penalty in (source.search.penalty, target.search.penalty):
+            if penalty is not None:
+                square = jnp.where(penalty > 0, penalty, square)
+        descriptor_distances = jnp.sum(square, axis=-1)
+        source, target = source._replace(search=None), target._replace(search=None)
+    return Matched(source, target, index.reshape(-1) >= 0, descriptor_distances, temperature, count)
 
 
 def distances_within(
@@ -183,27 +185,18 @@ def distances_within(
     return distances, distances <= max_distance
 
 
-def _squared_descriptor_distances(source: SearchPoints, target: SearchPoints) -> Float[Array, "n"]:
-    """Squared distance of the descriptors of matched rows, with the penalties for missing channels, metres²."""
-    square = (source.descriptors - target.descriptors) ** 2
-    for penalty in (source.penalty, target.penalty):
-        if penalty is not None:
-            square = jnp.where(penalty > 0, penalty, square)
-    return jnp.sum(square, axis=-1)
-
-
 def linearize_at(
     motion: Motion, matched: Matched, terms: tuple[AbstractTerm, ...]
 ) -> tuple[PosedMatches, Linearization, Float[Array, "n"]]:
     """The matches at a pose, the sum of the terms, and soft-assignment weights (1 for valid, 0 for invalid matches)."""
     posed = matched.at(motion)
-    found = linearize(terms, posed)
+    total = linearize(terms, posed)
     counts = jnp.asarray(matched.valid).astype(posed.moved.dtype)
     if matched.temperature is not None and matched.descriptor_distances is not None:
-        far = alg.inner(found.residual, found.residual) + matched.descriptor_distances
+        square = alg.inner(total.residual, total.residual) + matched.descriptor_distances
         shape = (matched.num_candidates, -1)
-        counts = _softmax((-0.5 * far / matched.temperature**2).reshape(shape), matched.valid.reshape(shape))
-    return posed, found.scaled(counts), counts
+        counts = _softmax((-0.5 * square / matched.temperature**2).reshape(shape), matched.valid.reshape(shape))
+    return posed, total.scaled(counts), counts
 
 
 def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Array, "n"]:

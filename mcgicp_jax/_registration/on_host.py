@@ -90,7 +90,7 @@ class HostExecutor(AbstractExecutor):
         """A function of matches, such as `sums_of`, as a row function with its arguments; a sum if `total`."""
         inputs = inputs_of(self.problem.source, self.problem.target, matches, with_noise, with_noise and not total)
         numbers = motion, matches.max_distance, matches.temperature, arguments
-        return RowFunction(of_matches(function, with_noise, total), numbers, inputs, matches.indices.shape[1], total)
+        return RowFunction(of_matches(function, total), numbers, inputs, matches.indices.shape[1], total)
 
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Any) -> Packed[Sums]:
         # Packed until the loop ends: to pass and to return dozens of arrays takes longer than to use them. Not awaited:

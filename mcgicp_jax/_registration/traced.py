@@ -97,7 +97,7 @@ class TracedExecutor(AbstractExecutor):
     ) -> Any:
         inputs = inputs_of(self.problem.source, self.problem.target, matches, with_noise, with_search=with_noise)
         numbers = motion, matches.max_distance, matches.temperature, arguments
-        return of_matches(function, with_noise)(numbers, *map(whole, inputs))
+        return of_matches(function)(numbers, *map(whole, inputs))
 
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[Array, ""]) -> Sums:
         problem = self.problem
