@@ -30,14 +30,6 @@ def per_channel(name: str, numbers: Float[AnyArray, "..."], num_channels: int) -
     return xp.broadcast_to(xp.asarray(numbers), (num_channels,))
 
 
-def check_covariance_fits(covariance: Float[AnyArray, "..."], count: int) -> None:
-    if covariance.shape not in ((), (count,), (count, count)):
-        raise ValueError(
-            f"channel_covariance: expected a scalar, shape ({count},) or ({count}, {count}), for clouds of {count} "
-            f"channels, got {covariance.shape}"
-        )
-
-
 def epsilon_of(value: ArrayLike) -> Float[Array, ""]:
     epsilon = positive_scalar("epsilon", value)
     # For smaller ε, 1 − (1 − ε) loses it to rounding, and the covariance becomes singular.

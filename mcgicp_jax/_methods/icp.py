@@ -15,19 +15,11 @@ from mcgicp_jax._local_geometry.channel_covariances import plane_covariance
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._methods.base import (
-    AbstractGeneralized,
-    AbstractOneSided,
-    epsilon_of,
-    identity,
-    known_geometry,
-    per_channel,
-    weights_of,
-)
+from mcgicp_jax._methods import base
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 
 
-class GICP(AbstractGeneralized):
+class GICP(base.AbstractGeneralized):
     """Generalized ICP (Segal, Haehnel & Thrun 2009), plane to plane.
 
     With tight tolerances, poses of LiDAR scans agree with those of small_gicp to 1e-5 m.
@@ -40,30 +32,30 @@ class GICP(AbstractGeneralized):
 
     def __init__(self, epsilon: ArrayLike = 1e-3):
         """Raises `ValueError` unless ε is positive, and large enough for the precision (1.2e-5 in float32)."""
-        self.epsilon = epsilon_of(epsilon)
+        self.epsilon = base.epsilon_of(epsilon)
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
         if around.given_covariance is not None:
             return around.given_covariance
-        return plane_covariance(known_geometry(local), self.epsilon.astype(around.own.dtype))
+        return plane_covariance(base.known_geometry(local), self.epsilon.astype(around.own.dtype))
 
 
-class PointToPoint(AbstractOneSided):
+class PointToPoint(base.AbstractOneSided):
     """Plain ICP (Besl & McKay 1992): M = I."""
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
-        return identity(around)
+        return base.identity(around)
 
 
-class PointToPlane(AbstractOneSided):
+class PointToPlane(base.AbstractOneSided):
     """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the normals n of the target."""
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
         given = around.given_covariance
-        return alg.outer(known_geometry(local).normal.T if given is None else alg.smallest_eigenvector(given))
+        return alg.outer(base.known_geometry(local).normal.T if given is None else alg.smallest_eigenvector(given))
 
 
-class ColorICP(AbstractOneSided):
+class ColorICP(base.AbstractOneSided):
     """ICP whose matches are nearest in position and channels (Johnson & Kang 1999): M = I.
 
     Attributes:
@@ -79,7 +71,7 @@ class ColorICP(AbstractOneSided):
 
     def __init__(self, channel_weights: Values):
         """Raises `ValueError` if a weight is negative or not finite, or has the wrong shape."""
-        self.channel_weights = weights_of(channel_weights)
+        self.channel_weights = base.weights_of(channel_weights)
         self.missing_variance = None
 
     @with_settings_of_package
@@ -93,12 +85,12 @@ class ColorICP(AbstractOneSided):
         return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
-        return identity(around)
+        return base.identity(around)
 
     def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
-        return per_channel("channel_weights", self.channel_weights, num_channels)
+        return base.per_channel("channel_weights", self.channel_weights, num_channels)
 
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.missing_variance is None:
             raise ValueError("missing_variance: not chosen yet; call method.resolve(source, target) first")
-        return per_channel("missing_variance", self.missing_variance, num_channels)
+        return base.per_channel("missing_variance", self.missing_variance, num_channels)

@@ -24,18 +24,8 @@ from mcgicp_jax._local_geometry.cloud_statistics import channel_noise, point_spa
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
 from mcgicp_jax._math.poses import Pose, pose_matrix
-from mcgicp_jax._math.robust_kernels import AbstractKernel
-from mcgicp_jax._methods.base import (
-    AbstractGeneralized,
-    check_covariance_fits,
-    covariance_of,
-    epsilon_of,
-    known_geometry,
-    per_channel,
-    positive_scalar,
-    weights_of,
-    with_unset_from,
-)
+from mcgicp_jax._math.robust_kernels import AbstractKernel, positive_scalar
+from mcgicp_jax._methods import base
 from mcgicp_jax._search.kd_tree import nearest_in_position
 from mcgicp_jax._terms.base import AbstractTerm, Mahalanobis
 from mcgicp_jax._terms.photometric import Photometric
@@ -58,7 +48,7 @@ _SAME_SURFACE = 0.5
 _LEAST_CORRELATION = 1e-6
 
 
-class MultiChannelGICP(AbstractGeneralized):
+class MultiChannelGICP(base.AbstractGeneralized):
     """Multi-channel generalized ICP (Servos & Waslander, ICRA 2014).
 
     The covariance of a point is ε along the normal and Ω within the surface (eqs. 6-10): small in the directions in
@@ -100,9 +90,9 @@ class MultiChannelGICP(AbstractGeneralized):
     ):
         """Raises `ValueError` unless Λ is symmetric and positive definite, α finite and not negative, ε positive and
         large enough for the precision, and the floor positive; or if a shape is wrong."""
-        self.channel_covariance = None if channel_covariance is None else covariance_of(channel_covariance)
-        self.channel_weights = None if channel_weights is None else weights_of(channel_weights)
-        self.epsilon = epsilon_of(epsilon)
+        self.channel_covariance = None if channel_covariance is None else base.covariance_of(channel_covariance)
+        self.channel_weights = None if channel_weights is None else base.weights_of(channel_weights)
+        self.epsilon = base.epsilon_of(epsilon)
         self.min_eigenvalue = None if min_eigenvalue is None else positive_scalar("min_eigenvalue", min_eigenvalue)
         self.photometric = photometric
 
@@ -145,7 +135,7 @@ class MultiChannelGICP(AbstractGeneralized):
             (covariance, weights, floor),
             is_leaf=lambda leaf: leaf is None,
         )
-        return with_unset_from(self, chosen)
+        return base.with_unset_from(self, chosen)
 
     def terms(
         self, source: PointCloud, target: PointCloud, robust: AbstractKernel | None, equalize_channels: bool
@@ -161,13 +151,10 @@ class MultiChannelGICP(AbstractGeneralized):
         given = around.given_covariance
         if given is not None:
             return given
-        if self.channel_covariance is None:
-            raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
         if around.near is None:
             raise ValueError(NO_NEIGHBORS)
-        local, dtype = known_geometry(local), around.own.dtype
-        epsilon, covariance = self.epsilon.astype(dtype), self.channel_covariance.astype(dtype)
-        check_covariance_fits(covariance, around.num_channels)
+        local, dtype = base.known_geometry(local), around.own.dtype
+        epsilon, covariance = self.epsilon.astype(dtype), self._covariance_for(around.num_channels).astype(dtype)
         if around.num_channels == 0:
             return plane_covariance(local, epsilon)
         floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, dtype)
@@ -176,15 +163,23 @@ class MultiChannelGICP(AbstractGeneralized):
     def weights(self, num_channels: int) -> Float[AnyArray, "C"]:
         if self.channel_weights is None:
             raise ValueError("channel_weights: not chosen yet; call method.resolve(source, target) first")
-        return per_channel("channel_weights", self.channel_weights, num_channels)
+        return base.per_channel("channel_weights", self.channel_weights, num_channels)
 
     def missing_variances(self, num_channels: int) -> Float[AnyArray, "C"]:
+        covariance = self._covariance_for(num_channels)
+        xp = numpy_for(covariance)
+        return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
+
+    def _covariance_for(self, count: int) -> Float[Array, "..."]:
+        """Λ, which must be chosen and fit clouds of `count` channels."""
         if self.channel_covariance is None:
             raise ValueError("channel_covariance: not chosen yet; call method.resolve(source, target) first")
-        xp = numpy_for(self.channel_covariance)
-        covariance = xp.asarray(self.channel_covariance)
-        check_covariance_fits(covariance, num_channels)
-        return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
+        if self.channel_covariance.shape not in ((), (count,), (count, count)):
+            raise ValueError(
+                f"channel_covariance: expected a scalar, shape ({count},) or ({count}, {count}), for clouds of {count} "
+                f"channels, got {self.channel_covariance.shape}"
+            )
+        return self.channel_covariance
 
 
 @with_settings_of_package
@@ -237,7 +232,13 @@ def estimate_channel_covariance(
             f"{np.diagonal(counts).min():.0f} for {scarcest!r}; check the poses, or raise max_distance"
         )
     # The covariance of two channels that no match has in common is unknown, and set to 0.
-    return _positive_definite(products / np.maximum(counts, 1))
+    covariance = products / np.maximum(counts, 1)
+    deviations = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(np.float32).tiny))
+    scale = np.outer(deviations, deviations)
+    # Eigenvalues of the correlations can be 0 or negative if a channel never differs, or because the entries come from
+    # different matches.
+    values, vectors = np.linalg.eigh(covariance / scale)
+    return (vectors * np.maximum(values, _LEAST_CORRELATION)) @ vectors.T * scale
 
 
 def _differences(
@@ -258,11 +259,3 @@ def _differences(
             present &= np.asarray(cloud.channel_valid)[rows]
     values = [np.asarray(cloud.channels, np.float64)[rows] for cloud, rows in matched]
     return np.where(present, values[0] - values[1], 0), present
-
-
-def _positive_definite(covariance: Float[np.ndarray, "C C"]) -> Float[np.ndarray, "C C"]:
-    """Raise the eigenvalues of the correlation matrix to a positive minimum: they can be 0 or negative if a channel
-    never differs, or because the entries come from different matches."""
-    deviations = np.sqrt(np.maximum(np.diagonal(covariance), np.finfo(np.float32).tiny))
-    values, vectors = np.linalg.eigh(covariance / np.outer(deviations, deviations))
-    return (vectors * np.maximum(values, _LEAST_CORRELATION)) @ vectors.T * np.outer(deviations, deviations)
