@@ -115,7 +115,7 @@ def voxel_gaussians(
         covariances = covariances_of(GICP(), with_neighbors(cloud, None, NUM_NEIGHBORS))
         cloud = cloud.replace(covariances=covariances.astype(cloud.points.dtype))
     cells = _Cells(cloud, voxel_size, min_points, channel_size)
-    kept = cells.kept
+    kept, dtype = cells.kept, cloud.points.dtype
     if kept.sum() < MIN_POINTS:
         raise ValueError(
             f"voxel_size: expected a size that leaves at least {MIN_POINTS} cells of {min_points} points, got "
@@ -124,12 +124,13 @@ def voxel_gaussians(
     if of == "covariances":
         matrices = (cells.sum(np.asarray(cloud.covariances).reshape(-1, 9)) / cells.counts).T.reshape(-1, 3, 3)[kept]
     else:
-        matrices = _floored(cells.spread[:, kept], min_ratio)
+        values, vectors = np.linalg.eigh(cells.spread[:, kept][[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
+        raised = np.maximum(values, min_ratio * values[:, -1:])
+        matrices = (vectors * raised[:, None]) @ vectors.swapaxes(1, 2)
     counts = cells.counts if cloud.channel_valid is None else cells.sum(cloud.channel_valid)
     # Missing values are stored as 0 and do not add to the sum.
     channels = cells.sum(cloud.channels) / np.maximum(counts, 1)
-    dtype = cloud.points.dtype
-    made = preprocess(
+    gaussians = preprocess(
         PointCloud(
             cells.means[:, kept].T.astype(dtype),
             channels[:, kept].T.astype(dtype),
@@ -138,7 +139,7 @@ def voxel_gaussians(
             channel_names=cloud.channel_names,
         )
     )
-    return (made, cells.counts[kept]) if return_counts else made
+    return (gaussians, cells.counts[kept]) if return_counts else gaussians
 
 
 def voxel_cells(
@@ -211,9 +212,9 @@ def _split(
         # Points that lack a channel get a level of their own.
         levels = np.where(np.asarray(cloud.channel_valid)[order], levels, -np.inf)
     columns = [np.cumsum(np.bincount(starts, minlength=len(order))), *levels.T]
-    again = np.lexsort(columns[::-1])
-    changes = np.any([column[again][1:] != column[again][:-1] for column in columns], axis=0)
-    return order[again], np.flatnonzero(np.append(True, changes))
+    by_cell = np.lexsort(columns[::-1])
+    changes = np.any([column[by_cell][1:] != column[by_cell][:-1] for column in columns], axis=0)
+    return order[by_cell], np.flatnonzero(np.append(True, changes))
 
 
 @with_settings_of_package
@@ -238,7 +239,7 @@ def cell_moments(
     """
     if not is_concrete(cells):
         raise ValueError("cells: expected concrete integers, got tracers")
-    points, channels, cells = (numpy_for(each).asarray(each) for each in (points, channels, cells))
+    points, channels, cells = (numpy_for(rows).asarray(rows) for rows in (points, channels, cells))
     count = len(points) if points.ndim else 0
     for name, array, fits, kind in (
         ("points: expected (N, 3) numbers", points, points.shape == (count, 3), np.number),
@@ -258,8 +259,7 @@ def cell_moments(
 
 
 def _products(_: Any, own: Rows, mean: Rows) -> tuple[Float[Array, "n 6"]]:
-    x, y, z = (own.tree - mean.tree).T
-    return (jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1),)
+    return (alg.outer((own.tree - mean.tree).T).T,)
 
 
 def _raised(min_ratio: Any, own: Rows) -> tuple[Float[Array, "n 3 3"]]:
@@ -276,12 +276,6 @@ def _raised(min_ratio: Any, own: Rows) -> tuple[Float[Array, "n 3 3"]]:
     across = jnp.maximum(jnp.sum(normal * alg.multiply(symmetric, normal), axis=0), floor)
     raised = alg.embed(alg.floor_eigenvalues(within, floor), u, v) + across * alg.outer(normal)
     return (alg.matrix_from_symmetric(raised),)
-
-
-def _floored(symmetric: Float[np.ndarray, "6 M"], min_ratio: float) -> Float[np.ndarray, "M 3 3"]:
-    values, vectors = np.linalg.eigh(symmetric[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
-    raised = np.maximum(values, min_ratio * values[:, -1:])
-    return (vectors * raised[:, None]) @ vectors.swapaxes(1, 2)
 
 
 class AbstractNDT(AbstractMethod):
