@@ -74,8 +74,8 @@ class SurfaceTable:
     def num_points(self) -> int:
         return self.search.valid.size
 
-    def whole(self, num_threads: int | None = 1) -> Surface:
-        return _surface_in(self.table.trees(self.rows, num_threads), self.search)
+    def whole(self) -> Surface:
+        return _surface_in(self.table.trees(self.rows), self.search)
 
 
 # Inside transformations a `Surface`, else a table.
@@ -138,35 +138,27 @@ def surface_pair(
         observed: whether to compute observability, which `register` needs and the cost of given matches does not.
         source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
-    used = source if source_rows is None else _some_rows(source, source_rows)
+    matched = source if source_rows is None else _some_rows(source, source_rows)
     whole = cache(partial(local_geometries, source, target, method.uses_channels, (source_rows, None), num_threads))
     method = resolved(method, source, target, source_rows, num_threads, whole)
-    terms = method.terms(used, target, robust, equalize_channels)
+    terms = method.terms(matched, target, robust, equalize_channels)
     kinds = kinds_of(terms)
     # Raises an error if observability is needed and a cloud has no neighbours.
     with_geometry = observed or (source.deferred_neighbors is not None and target.deferred_neighbors is not None)
     if is_concrete(method, source, target):
-        of_source, of_target = (
-            SurfaceTable(
-                surface_table(cloud, method, kinds, with_geometry, observed), rows, searchable(method, points), observed
-            )
-            for cloud, points, rows in ((source, used, source_rows), (target, target, None))
-        )
+        tables = [surface_table(cloud, method, kinds, with_geometry, observed) for cloud in (source, target)]
         if source_rows is None:
             # At once, and side by side: most rows are used.
-            calls = [partial(each.table.computed, None, num_threads) for each in (of_target, of_source)]
-            side_by_side(calls, num_threads)
+            side_by_side([partial(table.computed, None, num_threads) for table in tables[::-1]], num_threads)
+        of_source = SurfaceTable(tables[0], source_rows, searchable(method, matched), observed)
+        of_target = SurfaceTable(tables[1], None, searchable(method, target), observed)
         return SurfacePair(method, terms, of_source, of_target)
-    function = _surface_rows(kinds, observed, with_geometry)
-    inputs = [_inputs(method, cloud, with_geometry) for cloud in (source, target)]
+    inputs = [of_rows(_inputs(method, source, with_geometry), source_rows), _inputs(method, target, with_geometry)]
     if with_geometry:
-        locals, rows = whole(), (source_rows, None)
-        inputs = [[*of_rows(each, some), Input(local)] for each, some, local in zip(inputs, rows, locals, strict=True)]
-    else:
-        inputs[0] = of_rows(inputs[0], source_rows)
-    parts = over_both(function, method, *inputs)
-    both = [_surface_in(each, searchable(method, cloud)) for each, cloud in zip(parts, (used, target), strict=True)]
-    return SurfacePair(method, terms, *both)
+        inputs = [[*rows, Input(local)] for rows, local in zip(inputs, whole(), strict=True)]
+    parts = over_both(_surface_rows(kinds, observed, with_geometry), method, *inputs)
+    surfaces = _surface_in(parts[0], searchable(method, matched)), _surface_in(parts[1], searchable(method, target))
+    return SurfacePair(method, terms, *surfaces)
 
 
 def resolved(
@@ -184,7 +176,7 @@ def resolved(
             own = rows[0] if source_rows is None else source_rows[rows[0]]
             return local_geometries(source, target, method.uses_channels, (own, rows[1]), num_threads)
         # Inside transformations all rows are needed anyway.
-        of_source, of_target = (jax.tree.map(itemgetter(some), each) for each, some in zip(whole(), rows, strict=True))
+        of_source, of_target = (jax.tree.map(itemgetter(i), local) for local, i in zip(whole(), rows, strict=True))
         return of_source, of_target
 
     return method.resolve(source if source_rows is None else _some_rows(source, source_rows), target, geometries)
@@ -203,8 +195,8 @@ def _some_rows(cloud: PointCloud, rows: Any) -> PointCloud:
     """Some rows of a cloud, without neighbours, which are rows of the whole cloud."""
     xp = numpy_for(cloud, rows)
     names = ("points", "channels", "channel_valid", "valid", "covariances")
-    some = {name: xp.asarray(getattr(cloud, name))[rows] for name in names if getattr(cloud, name) is not None}
-    return cloud.replace_rows(deferred_neighbors=None, **some)
+    columns = {name: xp.asarray(getattr(cloud, name))[rows] for name in names if getattr(cloud, name) is not None}
+    return cloud.replace_rows(deferred_neighbors=None, **columns)
 
 
 def searchable(method: AbstractMethod, cloud: PointCloud) -> SearchPoints:
@@ -261,19 +253,18 @@ def differentiable_inputs(
     """The surfaces of matched points on the host, as inputs of a row function with `matched_rows`; with descriptors if
     `soft`. `fixed`: the clouds and the resolved method without traces of differentiation, see `primal`. `indices`: −1
     where there is no match."""
-    *clouds, chosen = fixed
-    sides = ((source, clouds[0], source_rows), (target, clouds[1], indices))
-    with_geometry = observed or all(cloud.deferred_neighbors is not None for _, cloud, _ in sides)
-    inputs = []
-    kinds = kinds_of(terms)
+    fixed_source, fixed_target, fixed_method = fixed
+    sides = ((source, fixed_source, source_rows), (target, fixed_target, indices))
+    with_geometry = observed or all(cloud.deferred_neighbors is not None for cloud in (source, target))
+    inputs, kinds = [], kinds_of(terms)
     for cloud, same, rows in sides:
         geometry = differentiable_geometry(cloud, method.uses_channels, same) if with_geometry else None
-        values = surface_table(same, chosen, kinds, with_geometry, observed)
+        values = surface_table(same, fixed_method, kinds, with_geometry, observed)
         inputs.append(Input(_table(cloud, method, kinds, geometry, observed, values), rows))
     if soft:
         for cloud, _, rows in sides:
-            given = Input(PointRows(cloud.points, cloud.channels, cloud.channel_valid))
-            inputs.append(Input(ComputedTable(_descriptors, method, [given], cloud.points.shape[0]), rows))
+            points = Input(PointRows(cloud.points, cloud.channels, cloud.channel_valid))
+            inputs.append(Input(ComputedTable(_descriptors, method, [points], cloud.points.shape[0]), rows))
     return inputs
 
 
@@ -294,11 +285,9 @@ def _table(
 def _descriptors(method: AbstractMethod, own: Rows) -> tuple[SearchPoints]:
     """Descriptors and penalties of `searchable`, for the derivative of a soft assignment."""
     points, channels, measured, *_ = own.tree
-    found = search_rows(
-        *search_numbers(method, channels, measured), points, channels, measured, jnp.ones(len(points), bool)
-    )
+    numbers, valid = search_numbers(method, channels, measured), jnp.ones(len(points), bool)
     # A mask is no number, and positions are in the surface already.
-    return (found._replace(points=None, valid=None),)
+    return (search_rows(*numbers, points, channels, measured, valid)._replace(points=None, valid=None),)
 
 
 def _surface_in(parts: tuple[Any, ...], search: SearchPoints) -> Surface:
@@ -315,11 +304,10 @@ def _inputs(method: AbstractMethod, cloud: PointCloud, with_geometry: bool) -> l
 
 @cache
 def _surface_rows(kinds: Kinds, observed: bool, with_geometry: bool) -> Callable[..., Any]:
-
     def surface(method: AbstractMethod, own: Rows, *rest: Rows) -> tuple[Any, ...]:
         near, local = (rest[:-1], rest[-1].tree) if with_geometry else (rest, None)
-        found = surface_of(method, kinds, neighborhoods(own, *near), local, observed)
-        return (found,) if found.noise is None else (found._replace(noise=None), found.noise)
+        result = surface_of(method, kinds, neighborhoods(own, *near), local, observed)
+        return (result,) if result.noise is None else (result._replace(noise=None), result.noise)
 
     return surface
 

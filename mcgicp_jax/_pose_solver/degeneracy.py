@@ -88,11 +88,8 @@ class Directions(eqx.Module):
     @property
     def constrained(self) -> Bool[AnyArray, "*batch 6"]:
         """Which directions are constrained, by geometry, by the channels, or by tie points and prior."""
-        return (
-            self.constrained_by_matches
-            if self.ties is None
-            else self.constrained_by_matches | (self.ties >= _LEAST_BY_TIES)
-        )
+        by_matches = self.constrained_by_matches
+        return by_matches if self.ties is None else by_matches | (self.ties >= _LEAST_BY_TIES)
 
 
 def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) -> Directions:
