@@ -96,33 +96,6 @@ class Residuals(NamedTuple):
     moved: Float[AnyArray, "*some n 3"]  # T a, metres; 0 where there is no match
 
 
-def fitted_channels(around: Neighborhoods, local: LocalGeometry | None) -> FittedChannels:
-    """Fit each channel over the tangent plane of each point; differentiable by points and channels."""
-    if local is None:
-        raise ValueError(NO_NEIGHBORS)
-    normal = local.normal.T
-    offsets = offsets_of(around)
-    basis = alg.orthonormal_basis(normal)
-    x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
-    square: Any = sum(offset * offset for offset in offsets)
-    farthest = _VALUE_RADIUS**2 * jnp.max(square, axis=0)
-    kernel = 1 - square / jnp.where(farthest > 0, farthest, 1)
-    fitted, gradients = [], []
-    for channel in range(around.num_channels):
-        measured, values = around.measured(channel), around.difference(channel)
-        fit = fit_linear(x, y, values, measured.astype(x.dtype))
-        gx, gy = fit.gradient
-        weights = jnp.where(measured, kernel, 0)
-        total = jnp.sum(weights, axis=0)
-        value = jnp.sum(weights * (values - gx * x - gy * y), axis=0) / jnp.where(total > 0, total, 1)
-        enough = (fit.weight > 3) & (fit.inverse[0] > 0)
-        if around.own_measured is not None:
-            enough = enough & around.own_measured[channel]
-        fitted.append(jnp.where(enough, around.own_channels[channel] + value, jnp.nan))
-        gradients.append(jnp.where(enough, gx * basis[0] + gy * basis[1], 0))
-    return FittedChannels(local.normal, jnp.stack(fitted, axis=1), jnp.stack(gradients).transpose(2, 0, 1))
-
-
 class Photometric(AbstractAdaptiveTerm):
     """The photometric term, see the module. Its numbers are constants to autodiff.
 
@@ -164,7 +137,30 @@ class Photometric(AbstractAdaptiveTerm):
         zeros, ones = (make(1 + num_channels, spacing.dtype) for make in (xp.zeros, xp.ones))
         return cls(spacing, zeros, ones, ones[1:], zeros[1:], coarse, equalizes_channels, robust=robust)
 
-    columns = staticmethod(fitted_channels)
+    @staticmethod
+    def columns(around: Neighborhoods, local: LocalGeometry | None) -> FittedChannels:
+        """Fit each channel over the tangent plane of each point; differentiable by points and channels."""
+        if local is None:
+            raise ValueError(NO_NEIGHBORS)
+        offsets, basis = offsets_of(around), alg.orthonormal_basis(local.normal.T)
+        x, y = (sum(offset * b for offset, b in zip(offsets, axis, strict=True)) for axis in basis)
+        square: Any = sum(offset * offset for offset in offsets)
+        farthest = _VALUE_RADIUS**2 * jnp.max(square, axis=0)
+        kernel = 1 - square / jnp.where(farthest > 0, farthest, 1)
+        fitted, gradients = [], []
+        for channel in range(around.num_channels):
+            measured, values = around.measured(channel), around.difference(channel)
+            fit = fit_linear(x, y, values, measured.astype(x.dtype))
+            gx, gy = fit.gradient
+            weights = jnp.where(measured, kernel, 0)
+            total = jnp.sum(weights, axis=0)
+            value = jnp.sum(weights * (values - gx * x - gy * y), axis=0) / jnp.where(total > 0, total, 1)
+            enough = (fit.weight > 3) & (fit.inverse[0] > 0)
+            if around.own_measured is not None:
+                enough = enough & around.own_measured[channel]
+            fitted.append(jnp.where(enough, around.own_channels[channel] + value, jnp.nan))
+            gradients.append(jnp.where(enough, gx * basis[0] + gy * basis[1], 0))
+        return FittedChannels(local.normal, jnp.stack(fitted, axis=1), jnp.stack(gradients).transpose(2, 0, 1))
 
     @property
     def estimates_gains(self) -> bool:
