@@ -273,9 +273,7 @@ def inverse_6(matrix: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
     ratio = mixed @ corner
     first = inverse_3(matrix[:3, :3] - ratio @ mixed.T)
     across = -first @ ratio
-    return xp.concatenate(
-        [xp.concatenate([first, across], axis=1), xp.concatenate([across.T, corner - ratio.T @ across], axis=1)]
-    )
+    return xp.block([[first, across], [across.T, corner - ratio.T @ across]])
 
 
 def solve(matrices: Float[AnyArray, "*n m m"], sides: Float[AnyArray, "*n m"]) -> Float[AnyArray, "*n m"]:

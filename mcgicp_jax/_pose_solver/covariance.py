@@ -68,22 +68,17 @@ def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
     noises, rows = _noises(matched), (searched(source), searched(target))
     residual = target.points.T - motion.move(source.points)
     across = jnp.dot(motion.rotation, noises[0].normal.T, precision="highest")
-    seen = alg.inner(across, residual) ** 2
     expected = noises[0].roughness + noises[1].roughness
-    complete = jnp.asarray(matched.valid)
-    for side in rows:
-        if side.penalty is not None:
-            complete = complete & jnp.all(side.penalty == 0, axis=1)
     noise = noises[0].descriptors + noises[1].descriptors
     difference = rows[0].descriptors - rows[1].descriptors
     # A quotient per match rather than one of medians: noise is higher at edges.
     quotient = jnp.sum(difference * difference, axis=1) / jnp.where(noise > 0, noise, jnp.nan)
-    return NoiseSample(
-        jnp.where(matched.valid, seen, jnp.nan),
-        jnp.where(matched.valid, expected, jnp.nan),
-        jnp.where(complete, quotient, jnp.nan),
-        jnp.where(matched.valid, 0.5 * (noises[0].neighborhood_radius + noises[1].neighborhood_radius), jnp.nan),
-    )
+    for side in rows:
+        if side.penalty is not None:
+            quotient = jnp.where(jnp.all(side.penalty == 0, axis=1), quotient, jnp.nan)
+    radius = 0.5 * (noises[0].neighborhood_radius + noises[1].neighborhood_radius)
+    columns = alg.inner(across, residual) ** 2, expected, quotient, radius
+    return NoiseSample(*(jnp.where(matched.valid, column, jnp.nan) for column in columns))
 
 
 def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:

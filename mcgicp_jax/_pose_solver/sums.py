@@ -73,7 +73,7 @@ class Sums(NamedTuple):
         """Root mean square distance of the moved, matched points from the centre, metres; 1 if it is 0."""
         xp = numpy_for(self.square_extent, self.count)
         square = self.square_extent / xp.maximum(self.count, 1)
-        return xp.where(square > 0, xp.sqrt(xp.where(square > 0, square, 1)), xp.ones_like(square))
+        return xp.sqrt(xp.where(square > 0, square, 1))
 
     @property
     def num_inliers(self) -> Int[Array, ""]:
