@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values
 from mcgicp_jax._clouds.preprocess import preprocess
@@ -218,9 +218,17 @@ def estimate_channel_covariance(
         if cloud.channel_names != names:
             raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
     products, counts = np.zeros((len(names), len(names))), np.zeros((len(names), len(names)))
-    for target, source in itertools.pairwise(zip(ready, matrices, strict=True)):
-        limit = _SAME_SURFACE * float(point_spacing(target[0])) if max_distance is None else max_distance
-        differences, present = _differences(*source, *target, limit)
+    for (target, target_pose), (source, source_pose) in itertools.pairwise(zip(ready, matrices, strict=True)):
+        limit = _SAME_SURFACE * float(point_spacing(target)) if max_distance is None else max_distance
+        moved, fixed = source.transform(np.linalg.inv(target_pose) @ source_pose).unpad(), target.unpad()
+        nearest = nearest_in_position(moved.points, fixed.points, limit)
+        matched = (moved, np.flatnonzero(nearest >= 0)), (fixed, nearest[nearest >= 0])
+        values = [np.asarray(cloud.channels, np.float64)[rows] for cloud, rows in matched]
+        present = np.ones(values[0].shape, bool)
+        for cloud, rows in matched:
+            if cloud.channel_valid is not None:
+                present &= np.asarray(cloud.channel_valid)[rows]
+        differences = np.where(present, values[0] - values[1], 0)
         number = np.maximum(present.sum(axis=0), 1)
         differences = np.where(present, differences - differences.sum(axis=0) / number, 0)
         products += differences.T @ differences
@@ -237,25 +245,5 @@ def estimate_channel_covariance(
     scale = np.outer(deviations, deviations)
     # Eigenvalues of the correlations can be 0 or negative if a channel never differs, or because the entries come from
     # different matches.
-    values, vectors = np.linalg.eigh(covariance / scale)
-    return (vectors * np.maximum(values, _LEAST_CORRELATION)) @ vectors.T * scale
-
-
-def _differences(
-    source: PointCloud,
-    source_pose: Float[np.ndarray, "4 4"],
-    target: PointCloud,
-    target_pose: Float[np.ndarray, "4 4"],
-    max_distance: float,
-) -> tuple[Float[np.ndarray, "N C"], Bool[np.ndarray, "N C"]]:
-    """Channel differences of the matches, 0 where either value is missing, and the mask of those present."""
-    matrix = np.linalg.inv(target_pose) @ source_pose
-    moved, fixed = source.transform(matrix).unpad(), target.unpad()
-    nearest = nearest_in_position(moved.points, fixed.points, max_distance)
-    matched = [(moved, np.flatnonzero(nearest >= 0)), (fixed, nearest[nearest >= 0])]
-    present = np.ones((len(matched[0][1]), moved.channels.shape[1]), bool)
-    for cloud, rows in matched:
-        if cloud.channel_valid is not None:
-            present &= np.asarray(cloud.channel_valid)[rows]
-    values = [np.asarray(cloud.channels, np.float64)[rows] for cloud, rows in matched]
-    return np.where(present, values[0] - values[1], 0), present
+    eigenvalues, vectors = np.linalg.eigh(covariance / scale)
+    return (vectors * np.maximum(eigenvalues, _LEAST_CORRELATION)) @ vectors.T * scale
