@@ -191,33 +191,21 @@ def register(
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
     warn_of_estimated_parameters(method, source, target, soft_matches is not False, equalize_channels)
-    result = register_from(source, target, method, init, options, tie_points, prior)
-    doubt = doubt_of(result)
-    if doubt:
-        warn(doubt if isinstance(init, str) else f'{doubt}; pass a better init, or init="global"')
-    return result
-
-
-def register_from(
-    source: PointCloud | Values,
-    target: PointCloud | Values,
-    method: AbstractMethod,
-    init: Any,
-    options: Options,
-    tie_points: GivenTiePoints | None = None,
-    prior: GivenPrior | None = None,
-) -> RegistrationResult:
-    check_method(method)
     trusted = True
+    pose: Any = init
     if isinstance(init, str):
         start = start_from_anywhere(init, primal(source), primal(target))
         if start is None:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
-        init, trusted = start.matrix, start.success
+        pose, trusted = start.matrix, start.success
         if not trusted:
             warn(doubt_of_start_pose(start))
         options = replace(options, max_coarse_distance=coarse_distance_from(start, options))
-    return verified(register_pair(source, target, method, init, options, tie_points, prior), trusted)
+    result = verified(register_pair(source, target, method, pose, options, tie_points, prior), trusted)
+    doubt = doubt_of(result)
+    if doubt:
+        warn(doubt if isinstance(init, str) else f'{doubt}; pass a better init, or init="global"')
+    return result
 
 
 def doubt_of_start_pose(start: GlobalPoseResult) -> str:
