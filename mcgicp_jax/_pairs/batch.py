@@ -156,8 +156,10 @@ def _pairs(
     if isinstance(init, str) and init != "global":
         raise ValueError(f'init: expected a pose, "global", or one per pair, got {init!r}')
     sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init, "priors": priors}
-    common = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets), "init": _is_one_pose(init)}
-    common["priors"] = priors is None
+    num_dimensions = init.wxyz_xyz.ndim + 1 if isinstance(init, jaxlie.SE3) else getattr(init, "ndim", None)
+    is_one_pose = init is None or isinstance(init, str) or num_dimensions == 2
+    common = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets)}
+    common |= {"init": is_one_pose, "priors": priors is None}
     if common["sources"] and common["targets"]:
         raise ValueError("sources: expected several clouds on at least one side, got one on each; call register")
     for name, value in sides.items():
@@ -196,9 +198,3 @@ def _is_one_cloud(value: object) -> bool:
         return True
     structured = getattr(getattr(value, "dtype", None), "names", None) is not None
     return callable(value) or structured or getattr(value, "ndim", None) == 2
-
-
-def _is_one_pose(value: object) -> bool:
-    if isinstance(value, jaxlie.SE3):
-        return value.wxyz_xyz.ndim == 1
-    return value is None or isinstance(value, str) or getattr(value, "ndim", None) == 2

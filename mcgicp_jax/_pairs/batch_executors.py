@@ -92,7 +92,7 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
         outcomes[pair.index] = job.prepare(pair)
     ready = {index: pair for index, pair in outcomes.items() if isinstance(pair, PreparedPair)}
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
-    sent = (Pair(each.index, *each.inputs.values()[:2], each.init, each.prior, each.traced) for each in ready.values())
+    sent = (Pair(pair.index, *pair.inputs.values()[:2], pair.init, pair.prior, pair.traced) for pair in ready.values())
     results = {index: result.with_warning() for index, result in outcomes.items() if index not in ready}
     results |= {result.index: result for result in _results(fixed, sent, executor, len(ready))}
     return [
@@ -267,7 +267,8 @@ class ChunkedExecutor:
             while self._submitted:
                 yield from self._receive()
             while self._suspects:
-                yield self._retried(self._suspects.popleft())
+                self._submit([self._suspects.popleft()])
+                yield from self._receive(last_try=True)
         finally:
             if isinstance(self._executor, Processes):
                 self._executor.shutdown(cancel_futures=bool(self._submitted))
@@ -282,51 +283,41 @@ class ChunkedExecutor:
         try:
             future = self._executor.submit(self._register, sent)
         except BrokenExecutor:
-            self._replacement = self._executor = executor_like(self._executor)
+            # The death of any worker breaks its process pool; one like it takes its place.
+            broken = self._executor
+            self._replacement = self._executor = ProcessPoolExecutor(
+                getattr(broken, "_max_workers", None),
+                getattr(broken, "_mp_context", None) or get_context("spawn"),
+                getattr(broken, "_initializer", None),
+                getattr(broken, "_initargs", ()),
+            )
             future = self._executor.submit(self._register, sent)
         self._submitted[future] = chunk
 
-    def _receive(self) -> Iterator[PairResult]:
+    def _receive(self, last_try: bool = False) -> Iterator[PairResult]:
         done, _ = futures.wait(self._submitted, return_when=futures.FIRST_COMPLETED)
         for future in done:
             chunk = self._submitted.pop(future)
             try:
                 results = future.result()
-            except PicklingError as error:
-                if self._at_home is not None:
-                    yield from map(PairResult.with_warning, self._at_home.register_chunk(chunk))
-                    continue
-                raise ValueError(
-                    f"pairs {chunk[0].index} to {chunk[-1].index}: expected clouds and functions that can be sent to "
-                    f"other processes; {_reason(error)}"
-                ) from error
             except Exception as error:
-                # A worker that dies breaks its pool, and so all chunks that were submitted.
-                if not self._suspects:
-                    warn(f"a worker failed ({_words(error)}); its pairs are submitted again, one by one, at the end")
-                self._suspects.extend(chunk)
-            else:
-                yield from map(PairResult.with_warning, results)
-
-    def _retried(self, pair: Pair) -> PairResult:
-        self._submit([pair])
-        future, _ = self._submitted.popitem()
-        try:
-            (result,) = future.result()
-        except Exception as error:
-            failed = RegistrationResult.without_pose(Status.WORKER_FAILED)
-            result = PairResult(pair.index, failed, f"its worker failed twice ({_words(error)})")
-        return result.with_warning()
-
-
-def executor_like(executor: Executor) -> Executor:
-    """A new process pool like a broken one: the death of any worker breaks its pool."""
-    return ProcessPoolExecutor(
-        getattr(executor, "_max_workers", None),
-        getattr(executor, "_mp_context", None) or get_context("spawn"),
-        getattr(executor, "_initializer", None),
-        getattr(executor, "_initargs", ()),
-    )
+                reason, results = _words(error), []
+                if last_try:
+                    failed = RegistrationResult.without_pose(Status.WORKER_FAILED)
+                    results = [PairResult(chunk[0].index, failed, f"its worker failed twice ({reason})")]
+                elif isinstance(error, PicklingError) and self._at_home is not None:
+                    results = self._at_home.register_chunk(chunk)
+                elif isinstance(error, PicklingError):
+                    raise ValueError(
+                        f"pairs {chunk[0].index} to {chunk[-1].index}: expected clouds and functions that can be sent "
+                        f"to other processes; {_reason(error)}"
+                    ) from error
+                else:
+                    # A worker that dies breaks its pool, and so all chunks that were submitted.
+                    if not self._suspects:
+                        warn(f"a worker failed ({reason}); its pairs are submitted again, one by one, at the end")
+                    self._suspects.extend(chunk)
+            yield from map(PairResult.with_warning, results)
 
 
 def _as_numpy(sent: Any) -> Any:

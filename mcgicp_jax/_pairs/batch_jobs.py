@@ -94,14 +94,14 @@ class PairResult:
     """The result of one pair.
 
     Attributes:
-        reason: why it has no pose; None if it has one, or the status is the reason.
+        reason: why it has no pose or a doubtful one; "" if it has a good one, or the status is the reason.
         warnings: issued in another process.
         jacobian: (7, ...) derivative of the centred pose by each leaf in `Pair.traced`.
     """
 
     index: int
     registration: RegistrationResult
-    reason: str | None = None
+    reason: str = ""
     warnings: tuple[str, ...] = ()
     jacobian: tuple[np.ndarray, ...] = ()
 
@@ -110,7 +110,7 @@ class PairResult:
         for message in self.warnings:
             warn(message)
         reason = self.reason or doubt_of(self.registration)
-        if reason is not None:
+        if reason:
             warning = PairWarning(f"pair {self.index}: {reason}")
             warning.index, warning.reason = self.index, reason
             warn(warning)
@@ -185,29 +185,23 @@ class BatchJob:
         options = self._options, self.voxel_size, self.num_neighbors, self.checked
         return preprocessed(_read(clouds), self.method, *options)
 
-    def _clouds(self, pair: Pair) -> list[PointCloud]:
-        """Both clouds by `ready`. Warnings of the pair as a whole do not name it, so that Python shows each once."""
-        with warnings_named(f"pair {pair.index}"):
-            clouds = self.ready({"source": pair.source, "target": pair.target})
-            if self.checked:
-                warn_of_lengths(*clouds)
-            return clouds
-
     @_of_a_pair
     def prepare(self, pair: Pair) -> PreparedPair | PairResult:
-        source, target = self._clouds(pair)
-        options = self.options
-        soft, equalized = options.soft_matches is not False, options.equalize_channels
-        warn_of_estimated_parameters(self.method, source, target, soft, equalized)
-        given = source, target, self.method, self.options
-        inputs = prepared(*given, prior=pair.prior, channels_checked=self.checked)
+        with warnings_named(f"pair {pair.index}"):
+            source, target = self.ready({"source": pair.source, "target": pair.target})
+            if self.checked:
+                warn_of_lengths(source, target)
+        options, soft = self.options, self.options.soft_matches is not False
+        # Warnings from here on do not name the pair, so that Python shows each once.
+        warn_of_estimated_parameters(self.method, source, target, soft, options.equalize_channels)
+        inputs = prepared(source, target, self.method, options, prior=pair.prior, channels_checked=self.checked)
         if not isinstance(pair.init, str):
             init = pair.prior[0] if pair.init is None and pair.prior is not None else pair.init
             return PreparedPair(pair.index, inputs, primal(init), pair.prior)
         start = start_from_anywhere(pair.init, primal(source), primal(target))
         if start is None:
             return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
-        distance = coarse_distance_from(start, self.options)
+        distance = coarse_distance_from(start, options)
         return PreparedPair(pair.index, inputs, start.matrix, pair.prior, doubt_of_start_pose(start), distance)
 
     @computed_on_cpu
@@ -261,8 +255,8 @@ class BatchJob:
         ended = [pair for pair in ready if isinstance(outcomes[pair.index], Run)]
         results = results_of([outcomes[pair.index] for pair in ended], [pair.inputs for pair in ended])
         for pair, result in zip(ended, results, strict=True):
-            reason = pair.doubt or outcomes[pair.index].doubt or None
-            outcomes[pair.index] = PairResult(pair.index, pair.checked(result), reason)
+            doubt = pair.doubt or outcomes[pair.index].doubt
+            outcomes[pair.index] = PairResult(pair.index, pair.checked(result), doubt)
         return [outcome.with_warning().registration for outcome in outcomes.values()]
 
     @_of_a_pair
@@ -288,8 +282,11 @@ class BatchJob:
         on_host = replace(self, options=replace(self.options, search=default_search(workers=1)))
         unchecked = replace(on_host, checked=False)
         search, most = self.options.search or DenseSearch(), self.options.max_source_points
-        pool = partial(ThreadPoolExecutor, thread_name_prefix="mcgicp")
-        with _cancelled(pool(1)) as one, _cancelled(pool(num_threads)) as threads:
+        one, threads = (ThreadPoolExecutor(count, thread_name_prefix="mcgicp") for count in (1, num_threads))
+        with contextlib.ExitStack() as stack:
+            # Waiting calls do not begin once this is left, be it by an error or an early end.
+            for pool in (one, threads):
+                stack.callback(pool.shutdown, cancel_futures=True)
             rejected: list[PairResult] = []
             again: collections.deque[Future[PairResult]] = collections.deque()
             register = with_settings(unchecked._register_prepared)
@@ -304,8 +301,7 @@ class BatchJob:
                     else:
                         yield pair
 
-            given = self.method, self.options, search, self.num_neighbors, self.covariances
-            for ended in run_pairs(ready(), *given):
+            for ended in run_pairs(ready(), self.method, self.options, search, self.num_neighbors, self.covariances):
                 while rejected:
                     yield rejected.pop(0)
                 while again and again[0].done():
@@ -340,32 +336,21 @@ class BatchJob:
             warn_of_inputs(source, target, self.method, self.options.equalize_channels)
         pose = se3_from_matrix(centred_pose(ready.init, source, target), source.points.dtype)
         # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.
-        sides = [self._padded(*both) for both in zip((source, target), clouds.values(), strict=True)]
+        sides = []
+        for before, cloud in zip(clouds.values(), (source, target), strict=True):
+            arrays: dict[str, Any] = {"origin": np.zeros(3, cloud.points.dtype), "channel_names": ()}
+            if not self.method.uses_channels:
+                arrays |= {"channels": cloud.points[:, :0], "channel_valid": None}
+            if before.deferred_neighbors is None:
+                arrays["deferred_neighbors"] = None
+            sides.append(cloud.replace_rows(**arrays).pad())
         return ready, ChunkPair(pose, source.points.dtype.type(ready.max_coarse_distance), *sides)
-
-    def _padded(self, cloud: PointCloud, before: PointCloud) -> PointCloud:
-        """What a chunk needs of a preprocessed cloud: neighbours only if it had them `before`."""
-        arrays: dict[str, Any] = {"origin": np.zeros(3, cloud.points.dtype), "channel_names": ()}
-        if not self.method.uses_channels:
-            arrays |= {"channels": cloud.points[:, :0], "channel_valid": None}
-        if before.deferred_neighbors is None:
-            arrays["deferred_neighbors"] = None
-        return cloud.replace_rows(**arrays).pad()
 
     def _result(self, index: int, result: RegistrationResult, doubt: str) -> PairResult:
         """The result without references to the clouds, and if so wanted without covariance."""
         if not self.covariances:
             result = result.build(**vars(result) | {"uncertainty": unknown_uncertainty()})
-        return PairResult(index, computed(result), doubt or None)
-
-
-@contextlib.contextmanager
-def _cancelled(threads: ThreadPoolExecutor) -> Iterator[ThreadPoolExecutor]:
-    """Context of an executor whose waiting calls do not begin once it is left, be it by an error or an early end."""
-    try:
-        yield threads
-    finally:
-        threads.shutdown(cancel_futures=True)
+        return PairResult(index, computed(result), doubt)
 
 
 def _is_small(pair: Pair) -> bool:
