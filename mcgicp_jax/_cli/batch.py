@@ -12,7 +12,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -35,9 +34,10 @@ from mcgicp_jax.io.files import replacing
 Row: TypeAlias = dict[str, str]
 # Source, target and initial pose, as in the first columns of the table.
 Key: TypeAlias = tuple[str, str, str]
-Reader: TypeAlias = Callable[[Path], mcg.PointCloud]
+# Initial poses of pairs.
+Starts: TypeAlias = dict[Key, Float[np.ndarray, "4 4"] | None]
 # Number and result of each pair, as it is completed.
-Registration: TypeAlias = Callable[..., Generator[tuple[int, mcg.RegistrationResult], None, None]]
+Completed: TypeAlias = Generator[tuple[int, mcg.RegistrationResult], None, None]
 
 # Columns of the table: the upper three rows of the pose matrix.
 _POSE = tuple(f"m{row}{column}" for row in range(3) for column in range(4))
@@ -49,22 +49,6 @@ _COLUMNS = ("source", "target", "init", "status", *_NUMBERS, "reason")
 _INTERRUPTED = 130
 # Statuses of pairs that could not be registered; a later run tries them again.
 _TRIED_AGAIN = ("invalid_input", "worker_failed")
-
-
-@dataclass(frozen=True)
-class FilePair:
-    folder: Path
-    source: str
-    target: str
-    init: Float[np.ndarray, "4 4"] | None = None
-
-    @property
-    def key(self) -> Key:
-        start = [] if self.init is None else self.init[:3].ravel().tolist()
-        return self.source, self.target, " ".join(map(repr, start))
-
-    def paths(self) -> tuple[Path, Path]:
-        return self.folder / self.source, self.folder / self.target
 
 
 @with_names
@@ -101,20 +85,19 @@ def batch(
     if output.suffix.lower() != ".csv":
         raise ValueError(f"output: expected a .csv file, got {output}")
     check_outputs(output)
-    file_pairs = _file_pairs(pairs, glob)
-    wanted = {pair.key: pair for pair in file_pairs}
+    wanted = _pairs_in(pairs, glob)
     rows = {(row["source"], row["target"], row["init"]): row for row in _read_rows(output)}
     rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
-    read, register = _reader_and_registration(file_pairs, method, shared)
+    register = _registration(pairs if pairs.is_dir() else pairs.parent, wanted, method, shared)
     executor = None if workers == "auto" else Processes(workers)
 
-    missing = {key: pair for key, pair in wanted.items() if key not in rows}
+    missing = {key: init for key, init in wanted.items() if key not in rows}
     finished = len(wanted) - len(missing)
     resumed = f", of which {finished:,} are in {output} and are kept, whatever the options were" if finished else ""
     print(f"pairs:     {len(wanted):,}{resumed}")
     interrupted = False
     if missing:
-        interrupted = _register_missing(missing, read, partial(register, executor=executor), output, rows, finished)
+        interrupted = _register_missing(list(missing), partial(register, missing, executor), output, rows, finished)
     rows = {key: rows[key] for key in wanted if key in rows} | rows
     _write_rows(output, rows.values())
     print(f"table:     {output}")
@@ -129,10 +112,11 @@ def batch(
     return 1 if failed else 0
 
 
-def _file_pairs(path: Path, glob: str) -> list[FilePair]:
+def _pairs_in(path: Path, glob: str) -> Starts:
+    """The pairs of a CSV file or of a folder, with their initial poses."""
     if path.is_dir():
         names = [cloud.name for cloud in clouds_in(path, glob).paths]
-        return [FilePair(path, source, target) for target, source in itertools.pairwise(names)]
+        return {(source, target, ""): None for target, source in itertools.pairwise(names)}
     # Spreadsheets write a byte order mark, people a blank after the comma.
     with open(path, newline="", encoding="utf-8-sig") as file:
         try:
@@ -143,38 +127,38 @@ def _file_pairs(path: Path, glob: str) -> list[FilePair]:
     columns = reader.fieldnames or []
     if not {"source", "target"} <= set(columns):
         raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
-    pairs = []
+    pairs: list[tuple[Key, Any]] = []
     for row in reader:
         line = f"{path}: line {reader.line_num}"
         if not row["source"] or not row["target"]:
             raise ValueError(f"{line}: expected two files, got {row}")
-        init = None
+        init, numbers = None, list[float]()
         if set(_POSE) <= set(columns):
             try:
                 numbers = [float(row[name]) for name in _POSE]
             except (TypeError, ValueError) as error:
                 raise ValueError(f"{line}: expected numbers in m00 ... m23, got {row}") from error
             init = np.vstack([np.reshape(numbers, (3, 4)), [0, 0, 0, 1]])
-        pairs.append(FilePair(path.parent, row["source"], row["target"], init))
+        pairs.append(((row["source"], row["target"], " ".join(map(repr, numbers))), init))
     if not pairs:
         raise ValueError(f"{path}: expected pairs of clouds, got none")
-    (source, target, _), count = collections.Counter(pair.key for pair in pairs).most_common(1)[0]
+    (source, target, _), count = collections.Counter(key for key, _ in pairs).most_common(1)[0]
     if count > 1:
         raise ValueError(f"{path}: expected each pair once from each initial pose, got {source} {target} several times")
-    return pairs
+    return dict(pairs)
 
 
-def _reader_and_registration(pairs: list[FilePair], method: Method, options: Options) -> tuple[Reader, Registration]:
-    """Functions that read a cloud and that register pairs, with defaults from the first pair that can be read."""
-    for pair in pairs:
+def _registration(folder: Path, pairs: Iterable[Key], method: Method, options: Options) -> Callable[..., Completed]:
+    """A function that registers pairs by an executor, with defaults from the first pair that can be read."""
+    for *names, _ in pairs:
         try:
-            source, target = (io.read(path, columns=options.columns) for path in pair.paths())
+            source, target = (io.read(folder / name, columns=options.columns) for name in names)
             break
         except (ValueError, OSError) as error:
             reason = error
     else:
         raise reason
-    choices = Choices(options, (pair.source, pair.target), (source, target))
+    choices = Choices(options, names, (source, target))
     name = choices.method_name(method)
     size = None if options.voxel_size == "off" else options.voxel_size
     print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
@@ -182,14 +166,16 @@ def _reader_and_registration(pairs: list[FilePair], method: Method, options: Opt
     def preprocessed() -> tuple[mcg.PointCloud, mcg.PointCloud]:
         return choices.preprocess(source), choices.preprocess(target)
 
-    register = partial(
-        mcg.register_as_completed,
-        method=choices.method(name, preprocessed),
-        voxel_size=size,
-        num_neighbors=options.num_neighbors,
-        **choices.arguments(name, preprocessed),
-    )
-    return partial(_read, choices.channels, options.columns), register
+    resolved_method, arguments = choices.method(name, preprocessed), choices.arguments(name, preprocessed)
+    arguments |= {"voxel_size": size, "num_neighbors": options.num_neighbors}
+    read = partial(_read, choices.channels, options.columns)
+
+    def register(starts: Starts, executor: Processes | None) -> Completed:
+        sources, targets = ([partial(read, folder / key[side]) for key in starts] for side in (0, 1))
+        inits = list(starts.values())
+        return mcg.register_as_completed(sources, targets, resolved_method, init=inits, executor=executor, **arguments)
+
+    return register
 
 
 def _read(channels: Sequence[str], columns: int | None, path: Path) -> mcg.PointCloud:
@@ -200,21 +186,20 @@ def _read(channels: Sequence[str], columns: int | None, path: Path) -> mcg.Point
 
 
 def _register_missing(
-    pairs: dict[Key, FilePair], read: Reader, register: Registration, output: Path, rows: dict[Key, Row], finished: int
+    keys: list[Key], register: Callable[[], Completed], output: Path, rows: dict[Key, Row], finished: int
 ) -> bool:
     """Register pairs, add their rows to the table and to `rows`, and return whether Ctrl-C stopped it."""
-    keys, reasons = list(pairs), dict[int, str]()
-    sources, targets = ([partial(read, pair.paths()[side]) for pair in pairs.values()] for side in (0, 1))
-    inits = [pair.init for pair in pairs.values()]
+    reasons: dict[int, str] = {}
     interrupted, begin = False, time.perf_counter()
     _write_rows(output, rows.values())
     with (
-        open(output, "ab", buffering=0) as table,
-        tqdm(total=finished + len(pairs), initial=finished, unit="pair", disable=None) as bar,
+        # Each row is written at once.
+        open(output, "a", newline="", encoding="utf-8", buffering=1) as file,
+        tqdm(total=finished + len(keys), initial=finished, unit="pair", disable=None) as bar,
         warnings.catch_warnings(),
         _interrupts() as pressed,
     ):
-        show = warnings.showwarning
+        writer, show = csv.DictWriter(file, _COLUMNS, lineterminator="\n"), warnings.showwarning
 
         # Reasons for failure go into the row and to stderr.
         def note_reason(message: Warning | str, *rest: Any, **options: Any) -> None:
@@ -227,19 +212,19 @@ def _register_missing(
         warnings.simplefilter("always", mcg.PairWarning)
         warnings.showwarning = note_reason
         try:
-            with contextlib.closing(register(sources, targets, init=inits)) as completed:
+            with contextlib.closing(register()) as completed:
                 for index, result in completed:
                     row = rows[keys[index]] = _row(keys[index], result, reasons.pop(index, ""))
-                    table.write(_line(row).encode())
+                    writer.writerow(row)
                     bar.update()
                     if pressed:
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
             interrupted = True
-    done = [rows[key]["status"] for key in pairs if key in rows]
+    done = [rows[key]["status"] for key in keys if key in rows]
     registered = sum(status not in _TRIED_AGAIN for status in done)
     rate = f", {registered / (time.perf_counter() - begin):.3g} pairs per second" if registered else ""
-    print(f"done:      {len(done):,} of {len(pairs):,}{rate}")
+    print(f"done:      {len(done):,} of {len(keys):,}{rate}")
     return interrupted
 
 
@@ -276,14 +261,12 @@ def _read_rows(path: Path) -> list[Row]:
 
 
 def _write_rows(path: Path, rows: Iterable[Row]) -> None:
+    table = StringIO()
+    writer = csv.DictWriter(table, _COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     with replacing(path) as file:
-        file.write((",".join(_COLUMNS) + "\n" + "".join(map(_line, rows))).encode())
-
-
-def _line(row: Row) -> str:
-    line = StringIO()
-    csv.DictWriter(line, _COLUMNS, lineterminator="\n").writerow(row)
-    return line.getvalue()
+        file.write(table.getvalue().encode())
 
 
 def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
