@@ -69,10 +69,9 @@ def _run(args: Sequence[str]) -> int:
             raise
         except (RuntimeError, AssertionError):
             # JAX looks for its platform at the first computation.
-            try:
+            has_device = False
+            with contextlib.suppress(RuntimeError, AssertionError):
                 has_device = len(jax.devices()) > 0
-            except (RuntimeError, AssertionError):
-                has_device = False
             if has_device:
                 raise
             problem = f"JAX has no device for JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS')}"
