@@ -60,8 +60,7 @@ def bare_pair() -> tuple[PointCloud, PointCloud, Matrix, np.ndarray]:
 
 
 def _observe(pattern: int | None, size: int, rng: np.random.Generator, pose: Matrix) -> PointCloud:
-    rotation, center = pose[:3, :3], pose[:3, 3]
-    hits = cast(center, random_rays(rng, size) @ rotation.T, _walls(center[0]), _MAX_RANGE)
+    hits = cast(pose, random_rays(rng, size), _walls(pose[0, 3]), _MAX_RANGE)
     intensity = np.full(len(hits.points), 0.5)
     if pattern is not None:
         intensity += patches(hits.points, _PATCHES, pattern)
@@ -70,7 +69,7 @@ def _observe(pattern: int | None, size: int, rng: np.random.Generator, pose: Mat
         intensity += 0.3 * (random_cells(panel, pattern + len(_PATCHES)) - 0.5)
     distance = hits.distance + _RANGE_NOISE * rng.normal(size=hits.distance.shape)
     intensity += _INTENSITY_NOISE * rng.normal(size=intensity.shape)
-    return PointCloud(distance[:, None] * (hits.rays @ rotation), np.clip(intensity, 0, 1), channel_names=["intensity"])
+    return PointCloud(distance[:, None] * hits.sensor_rays, np.clip(intensity, 0, 1), channel_names=["intensity"])
 
 
 def _walls(along: float) -> list[Box]:

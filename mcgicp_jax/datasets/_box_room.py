@@ -93,9 +93,8 @@ def _pose(step: float, start: float, tilt_start: float, index: int) -> Matrix:
 def _observe(
     boxes: list[Box], colors: Colors, seed: int, size: int, noise: float, along_rays: bool, rng: Generator, pose: Matrix
 ) -> PointCloud:
-    rotation, center = pose[:3, :3], pose[:3, 3]
-    hits = cast(center, random_rays(rng, size) @ rotation.T, boxes, np.inf)
-    rays = hits.rays @ rotation
+    hits = cast(pose, random_rays(rng, size), boxes, np.inf)
+    rays = hits.sensor_rays
     error = rng.normal(size=(len(rays), 1)) * rays if along_rays else rng.normal(size=rays.shape)
     points = hits.distance[:, None] * rays + noise * _POINT_NOISE * error
     paint = colors[hits.solid] + patches(hits.points, _PAINT, seed)[:, None] * _PAINT_COLOR

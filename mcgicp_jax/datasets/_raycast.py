@@ -70,14 +70,17 @@ class Hits(NamedTuple):
     """The hits of rays on solids in the world frame, without the rays that miss."""
 
     rays: Rays  # unit vectors
+    sensor_rays: Rays  # the same in the sensor's frame
     distance: Distances
     points: Rays
     normals: Rays  # unit vectors towards the sensor
     solid: Int[np.ndarray, "N"]  # index of the solid
 
 
-def cast(origin: Vector, rays: Rays, solids: Sequence[Solid], max_range: float) -> Hits:
-    """The nearest hit of each ray within `max_range`; ties go to the first solid."""
+def cast(pose: Float[np.ndarray, "4 4"], rays: Rays, solids: Sequence[Solid], max_range: float) -> Hits:
+    """The nearest hit within `max_range` of each ray, which is in the sensor's frame; ties go to the first solid."""
+    rotation, origin = pose[:3, :3], pose[:3, 3]
+    rays = rays @ rotation.T
     distance, normals, solid = np.full(len(rays), max_range), np.zeros_like(rays), np.full(len(rays), -1)
     for number, candidate in enumerate(solids):
         # Only the rays in the cone around its bounding sphere may hit the solid.
@@ -94,8 +97,9 @@ def cast(origin: Vector, rays: Rays, solids: Sequence[Solid], max_range: float) 
         rows = rows[nearer]
         distance[rows], normals[rows], solid[rows] = entry[nearer], entry_normals[nearer], number
     hit = solid >= 0
-    points = origin + distance[hit, None] * rays[hit]
-    return Hits(rays[hit], distance[hit], points, normals[hit], solid[hit])
+    rays, distance = rays[hit], distance[hit]
+    points = origin + distance[:, None] * rays
+    return Hits(rays, rays @ rotation, distance, points, normals[hit], solid[hit])
 
 
 def random_rays(rng: np.random.Generator, size: int) -> Rays:

@@ -129,16 +129,12 @@ def _pose(smooth: bool, step: float, sway: float, yaw: float, tilt: float, time:
 
 
 def _observe(
-    things: list[_Thing], pattern: int, size: int, noise: float, rng: Generator, pose: Float[np.ndarray, "*poses 4 4"]
+    things: list[_Thing], pattern: int, size: int, noise: float, rng: Generator, poses: Float[np.ndarray, "*poses 4 4"]
 ) -> PointCloud:
     # Each pose of the turn measures one sector of the rays.
-    poses, solids = pose.reshape(-1, 4, 4), [thing.solid for thing in things]
+    poses, solids = poses.reshape(-1, 4, 4), [thing.solid for thing in things]
     rays = np.array_split(raycast.spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST), len(poses))
-    sectors, directions = [], []
-    for sector_pose, sector_rays in zip(poses, rays, strict=True):
-        rotation, center = sector_pose[:3, :3], sector_pose[:3, 3]
-        sectors.append(raycast.cast(center, sector_rays @ rotation.T, solids, _MAX_RANGE))
-        directions.append(sectors[-1].rays @ rotation)
+    sectors = [raycast.cast(pose, sector, solids, _MAX_RANGE) for pose, sector in zip(poses, rays, strict=True)]
     hits = raycast.Hits(*map(np.concatenate, zip(*sectors, strict=True)))
     times = None if len(poses) == 1 else np.repeat(np.arange(len(poses)), [len(sector.rays) for sector in sectors])
 
@@ -152,7 +148,7 @@ def _observe(
     sigma[:, 0] = np.hypot(_INTENSITY_NOISE, _INTENSITY_SPECKLE * intensity)
     channels = np.clip(channels + noise * sigma * rng.normal(size=channels.shape), 0, 1)
     distance = hits.distance + noise * _RANGE_NOISE * rng.normal(size=hits.distance.shape)
-    points = distance[:, None] * np.concatenate(directions)
+    points = distance[:, None] * hits.sensor_rays
     return PointCloud(points, channels, channel_names=("intensity", *COLORS), times=times)
 
 
