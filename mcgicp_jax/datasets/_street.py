@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import enum
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -45,24 +44,15 @@ _PLASTER = ((3.0, 0.06), (0.5, 0.05), (0.15, 0.03))
 _SLAB, _PIECE, _SIGN = 0.6, np.array([3.1, 1.55]), 3.7
 
 
-class _Kind(enum.IntEnum):
-    GROUND = 0
-    PAVEMENT = 1
-    BUILDING = 2
-    CAR = 3
-    POLE = 4
-    BIN = 5
-
-
 class _Thing(NamedTuple):
     """An object of the scene; colour and reflectance are without the pattern."""
 
-    kind: _Kind
+    kind: Literal["ground", "pavement", "building", "car", "pole", "bin"]
     solid: raycast.Solid
     color: Float[np.ndarray, "3"]
     reflectance: float  # at the wavelength of the laser, 0 to 1
-    # Of buildings: pitch along the façade, pitch upwards, width, height and recess; metres.
-    windows: Float[np.ndarray, "5"] | None = None
+    # Of buildings: pitch along the façade, pitch upwards, width, height and recess; metres. Of others: NaN.
+    windows: Float[np.ndarray, "5"] = np.full(5, np.nan)
 
 
 def street(
@@ -102,10 +92,10 @@ def street(
     rng, path_rng = scene_and_path_rng(seed)
     start, end = -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE
     road = raycast.Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
-    things = [_Thing(_Kind.GROUND, road, np.full(3, 0.33), 0.2)]
+    things = [_Thing("ground", road, np.full(3, 0.33), 0.2)]
     for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
         low, high = np.array([start, _KERB, -1.0]), np.array([end, 30.0, _KERB_HEIGHT])
-        things.append(_Thing(_Kind.PAVEMENT, _box(low, high, side), np.full(3, 0.52), 0.3))
+        things.append(_Thing("pavement", _box(low, high, side), np.full(3, 0.52), 0.3))
         # Each kind in order of x, so that a longer street begins like a shorter one.
         for make, kind_rng in zip((_building, _car, _pole, _bin), side_rng.spawn(4), strict=True):
             x = start
@@ -169,7 +159,7 @@ def _building(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]
     low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
     color, reflectance = rng.choice(_WALLS) * rng.uniform(0.85, 1.1), rng.uniform(0.25, 0.55)
     windows = np.array([*pitch, *opening, rng.uniform(0.08, 0.25)])
-    building = _Thing(_Kind.BUILDING, _box(low, high, side), color, reflectance, windows)
+    building = _Thing("building", _box(low, high, side), color, reflectance, windows)
     # The next building is adjacent, behind a passage, or across a side street.
     return [building], width + rng.choice([0, rng.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
 
@@ -181,29 +171,27 @@ def _car(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     body = _box(np.array([x, y, 0.2]), np.array([x + length, y + width, sill]), side)
     bonnet, boot = rng.uniform((0.8, 0.2), (1.3, 0.8))
     low, high = np.array([x + bonnet, y + 0.12, sill]), np.array([x + length - boot, y + width - 0.12, roof])
-    cabin = _Thing(_Kind.CAR, _box(low, high, side), 0.5 * color + 0.5 * _GLASS, 0.1)
+    cabin = _Thing("car", _box(low, high, side), 0.5 * color + 0.5 * _GLASS, 0.1)
     gap = rng.choice([rng.uniform(0.6, 1.5), rng.uniform(4, 14)])
-    return [_Thing(_Kind.CAR, body, color, reflectance), cabin], length + gap
+    return [_Thing("car", body, color, reflectance), cabin], length + gap
 
 
 def _pole(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     radius, height = rng.uniform((0.06, 4.0), (0.18, 8.0))
     cylinder = raycast.Cylinder(np.array([x, side * (_KERB + rng.uniform(0.4, 0.9)), 0.0]), radius, height)
-    pole = _Thing(_Kind.POLE, cylinder, rng.uniform(0.2, 0.5, 3), rng.uniform(0.3, 0.7))
-    return [pole], rng.uniform(8, 22)
+    return [_Thing("pole", cylinder, rng.uniform(0.2, 0.5, 3), rng.uniform(0.3, 0.7))], rng.uniform(8, 22)
 
 
 def _bin(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
     size = rng.uniform((0.4, 0.4, 0.8), (1.2, 0.7, 1.3))
     low = np.array([x, rng.uniform(_KERB + 1.2, _FACADE - 0.9), 0.0])
     box = _box(low, low + size, side)
-    return [_Thing(_Kind.BIN, box, rng.uniform(0.1, 0.6, 3), rng.uniform(0.2, 0.5))], rng.uniform(6, 25)
+    return [_Thing("bin", box, rng.uniform(0.1, 0.6, 3), rng.uniform(0.2, 0.5))], rng.uniform(6, 25)
 
 
 def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hits, Mask]:
     """Move hits in the opening of a window on to the glass or the reveal, and return the mask of hits on glass."""
-    no_windows = np.full(5, np.nan)
-    windows = np.array([no_windows if thing.windows is None else thing.windows for thing in things])[hits.solid]
+    windows = np.array([thing.windows for thing in things])[hits.solid]
     rows = np.flatnonzero(np.isfinite(windows[:, 0]) & (hits.normals[:, 1] != 0))
     pitch, opening, recess = np.split(windows[rows], [2, 4], axis=1)
     corner = np.array([thing.solid.bounds[0] for thing in things])[hits.solid[rows]]
@@ -234,11 +222,11 @@ def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hit
 
 def _paint(hits: raycast.Hits, glass: Mask, things: list[_Thing], pattern: int) -> tuple[Colors, raycast.Distances]:
     """Colour and laser reflectance of the surface at each hit."""
-    kinds = np.array([thing.kind for thing in things])[hits.solid]
+    kinds = np.array([thing.kind for thing in things])
     colors = np.array([thing.color for thing in things])[hits.solid]
     reflectance = np.array([thing.reflectance for thing in things])[hits.solid]
 
-    rows = np.flatnonzero(kinds == _Kind.GROUND)
+    rows = np.flatnonzero((kinds == "ground")[hits.solid])
     ground = hits.points[rows, :2]
     stain = raycast.patches(ground, _ASPHALT, pattern)
     mended = np.where(raycast.random_cells(np.floor(ground / _PIECE).astype(int), pattern + 3) < 0.15, -0.09, 0)
@@ -253,13 +241,13 @@ def _paint(hits: raycast.Hits, glass: Mask, things: list[_Thing], pattern: int) 
     colors[rows] = np.where(marked[:, None], 0.85, colors[rows] + (stain + mended)[:, None])
     reflectance[rows] = np.where(marked, 0.85, reflectance[rows] + 0.6 * (stain + mended))
 
-    rows = np.flatnonzero(kinds == _Kind.PAVEMENT)
+    rows = np.flatnonzero((kinds == "pavement")[hits.solid])
     slab = raycast.random_cells(np.floor(hits.points[rows, :2] / _SLAB).astype(int), pattern + 5) - 0.5
     stain = 0.12 * slab + raycast.patches(hits.points[rows, :2], _ASPHALT, pattern + 6)
     colors[rows] += stain[:, None]
     reflectance[rows] += 0.6 * stain
 
-    rows = np.flatnonzero(kinds == _Kind.BUILDING)
+    rows = np.flatnonzero((kinds == "building")[hits.solid])
     stain = raycast.patches(hits.points[rows], _PLASTER, pattern + 9)
     colors[rows] += stain[:, None]
     reflectance[rows] += stain
