@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from scipy.spatial.transform import Rotation, Slerp
 
 from mcgicp_jax import io
@@ -75,12 +75,13 @@ class TUMFrames(AbstractFrames):
             raise ValueError(f"{folder}: expected depth and colour images within {_MAX_DIFFERENCE} s, found none")
         self._times = times[colored]
         super().__init__(len(self._times))
-        self._depths = [depths[row] for row in np.flatnonzero(colored)]
-        self._colors = [colors[row] for row in nearest[colored]]
+        self._depths, self._colors = depths[colored], colors[nearest[colored]]
         truth = folder / "groundtruth.txt"
-        # read_poses runs before loadtxt because its errors name the file.
-        poses = io.read_poses(truth) if truth.is_file() else None
-        self._truth = None if poses is None else (np.loadtxt(truth, usecols=0, ndmin=1), poses)
+        self._pose_times, self._poses = np.empty(0), np.empty((0, 4, 4))
+        if truth.is_file():
+            # read_poses runs before loadtxt because its errors name the file.
+            self._poses = io.read_poses(truth)
+            self._pose_times = np.loadtxt(truth, usecols=0, ndmin=1)
 
     def _frame(self, index: int) -> Frame:
         depth = read_depth(self.folder / self._depths[index])
@@ -91,9 +92,7 @@ class TUMFrames(AbstractFrames):
 
     def _pose(self, time: float) -> Float[np.ndarray, "4 4"] | None:
         """The measured pose interpolated to a time in seconds; None if it is unknown."""
-        if self._truth is None:
-            return None
-        times, poses = self._truth
+        times, poses = self._pose_times, self._poses
         after = int(np.searchsorted(times, time))
         if after < len(times) and times[after] == time:
             return poses[after]
@@ -104,11 +103,11 @@ class TUMFrames(AbstractFrames):
         return pose_of(rotation, [np.interp(time, times[around], values) for values in poses[around, :3, 3].T])
 
 
-def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], list[str]]:
+def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], Shaped[np.ndarray, "N"]]:
     """Time stamps in seconds, and file names."""
     rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
     try:
-        return np.array([float(time) for time, _ in rows]), [name for _, name in rows]
+        return np.array([float(time) for time, _ in rows]), np.array([name for _, name in rows])
     except ValueError as error:
         raise ValueError(f"{path}: expected lines of a time stamp and a file name: {error}") from error
 
