@@ -28,8 +28,8 @@ Pixels: TypeAlias = Float[np.ndarray, "N 2"]
 Colors: TypeAlias = Float[np.ndarray, "N 3"]
 Mask: TypeAlias = Bool[np.ndarray, "N"]
 
-# Independent random streams of one seed: the scene, the path of the sensor, and one per frame.
-_SCENE, _PATH, _FIRST_FRAME = 0, 1, 2
+# Independent random streams of one seed: the scene, the path of the sensor, and one per frame from this number on.
+_FIRST_FRAME = 2
 
 
 class AbstractFrames(Sequence[Frame]):
@@ -155,7 +155,7 @@ class SyntheticFrames(AbstractFrames):
 
 def scene_and_path_rng(seed: int) -> tuple[np.random.Generator, np.random.Generator]:
     """Random generators of the scene and of the sensor's path, independent of the frames' generators."""
-    scene, path = (np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(key,))) for key in (_SCENE, _PATH))
+    scene, path = np.random.default_rng(seed).spawn(_FIRST_FRAME)
     return scene, path
 
 
@@ -166,7 +166,6 @@ def pose_of(rotation: Rotation, position: Any) -> Matrix:
 
 
 def check_scene(points_per_frame: int, noise: float, most: int = 10_000_000) -> None:
-    """Raise `ValueError` unless 1 ≤ `points_per_frame` ≤ `most`, and `noise` is 0 or more."""
     if not noise >= 0:
         raise ValueError(f"noise: expected 0 or more, got {noise}")
     if not 1 <= points_per_frame <= most:
