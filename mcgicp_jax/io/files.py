@@ -76,7 +76,9 @@ def columns_of(cloud: PointCloud) -> Columns:
                 f"channel_names: expected unique names of letters, digits, _ . -, got {name!r}; .npz can hold it"
             )
     columns = dict(zip("xyz", cloud.points.T, strict=True))
-    columns |= {column_name(name): values for name, values in zip(names, cloud.channels.T, strict=True)}
+    for name, values in zip(names, cloud.channels.T, strict=True):
+        # The prefix keeps names that readers would skip or change.
+        columns[name if channel_name(name) == name else f"channel_{name}"] = values
     if cloud.times is not None:
         columns["time"] = np.asarray(cloud.times)
     colours = {name: columns[name] for name in COLORS if name in columns}
@@ -84,7 +86,3 @@ def columns_of(cloud: PointCloud) -> Columns:
     if all(np.array_equal(whole[name].astype(cloud.points.dtype) / 255, colours[name]) for name in colours):
         columns |= {name: values.astype(np.uint8) for name, values in whole.items()}
     return columns
-
-
-def column_name(channel: str) -> str:
-    return channel if channel_name(channel) == channel else f"channel_{channel}"

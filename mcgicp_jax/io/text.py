@@ -11,7 +11,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.columns import COLORS, channel_name
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.files import cloud_of, column_name, columns_of, plain_numbers
+from mcgicp_jax.io.files import cloud_of, columns_of, plain_numbers
 from mcgicp_jax.io.poses import are_poses
 
 # Number of lines from which poses are recognised: so many points are not in order of their first coordinate with unit
@@ -31,8 +31,7 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
         raise ValueError(f"expected at least three columns, x, y and z, got {table.shape[1]}")
     names = names or ["x", "y", "z", *(f"channel_{i}" for i in range(table.shape[1] - 3))]
     columns = dict(zip(names, table.T, strict=True))
-    whole = [name for name, cell in zip(names, cells, strict=True) if cell.isdigit()]
-    colours = [name for name in whole if channel_name(name) in COLORS]
+    colours = [name for name, cell in zip(names, cells, strict=True) if cell.isdigit() and channel_name(name) in COLORS]
     values = np.array([columns[name] for name in colours])
     if colours and ((values == np.rint(values)) & (values >= 0) & (values <= 65535)).all():
         integers = values.astype(np.uint8 if values.max() < 256 else np.uint16)
@@ -84,7 +83,7 @@ def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
             return names if len(names) == len(cells) else [], line, cells
         if comment:
             cells = cells[1 + max((i for i, cell in enumerate(cells) if cell.endswith(":")), default=-1) :]
-        if not comment:
+        else:
             cells = [re.sub(r"\s*[\[(].*[\])]$", "", cell) for cell in cells]
         if {"x", "y", "z"} <= {cell.lower() for cell in cells}:
             names, commented = [cell or "index" for cell in cells], comment
@@ -102,9 +101,7 @@ def _is_number(cell: str) -> bool:
 
 
 def write_text(file: BinaryIO, cloud: PointCloud, delimiter: str, mark: str) -> None:
-    columns_of(cloud)
     times = [] if cloud.times is None else [np.asarray(cloud.times)]
-    names = ["x", "y", "z", *map(column_name, cloud.channel_names), *["time"] * len(times)]
     # "%s" prints the shortest number that is exact in its own dtype, so all values are converted to float64 first.
     table = np.column_stack([cloud.points, cloud.channels, *times]).astype(np.float64)
-    np.savetxt(file, table, fmt="%s", delimiter=delimiter, header=delimiter.join(names), comments=mark)
+    np.savetxt(file, table, fmt="%s", delimiter=delimiter, header=delimiter.join(columns_of(cloud)), comments=mark)
