@@ -39,9 +39,9 @@ def rgb_to_lab(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     power = colors > _SRGB_LIMIT
     base = (xp.where(power, colors, 1) + _SRGB_OFFSET) / (1 + _SRGB_OFFSET)
     linear = xp.where(power, base**_SRGB_POWER, colors / _SRGB_SLOPE)
-    xyz = xp.stack([_weighted(row, linear) for row in _XYZ_OF_WHITE], -1)
+    xyz = xp.stack([_weighted(row, linear) for row in _XYZ_OF_WHITE])
     root = xyz > _LAB_LIMIT
-    x, y, z = _parts(xp.where(root, xp.cbrt(xp.where(root, xyz, 1)), _LAB_SLOPE * xyz + _LAB_OFFSET))
+    x, y, z = xp.where(root, xp.cbrt(xp.where(root, xyz, 1)), _LAB_SLOPE * xyz + _LAB_OFFSET)
     return xp.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], -1)
 
 
@@ -60,8 +60,7 @@ def rgb_to_hsv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     Raises:
         ValueError: if the last axis does not have three entries.
     """
-    colors, xp = _colors(rgb)
-    red, green, blue = _parts(colors)
+    (red, green, blue), xp = _colors(rgb)
     value = xp.maximum(xp.maximum(red, green), blue)
     chroma = value - xp.minimum(xp.minimum(red, green), blue)
     colored, bright = chroma > 0, value > 0
@@ -88,7 +87,7 @@ def rgb_to_yuv(rgb: Values) -> Float[AnyArray, "*batch 3"]:
     """
     colors, xp = _colors(rgb)
     luma = _weighted(_LUMA, colors)
-    red, _, blue = _parts(colors)
+    red, _, blue = colors
     return xp.stack([luma, _BLUE * (blue - luma), _RED * (red - luma)], -1)
 
 
@@ -97,21 +96,18 @@ COLOR_SPACES = {"lab": rgb_to_lab, "hsv": rgb_to_hsv, "yuv": rgb_to_yuv}
 
 
 def _colors(rgb: Values) -> tuple[Any, Any]:
-    """The checked colours in floating point, and their array module: NumPy for concrete colours, else `jax.numpy`."""
+    """The checked red, green and blue in floating point, (3, ...), and their array module: `jax.numpy` if traced."""
     xp = numpy_for(rgb)
     colors: Any = xp.asarray(rgb)
     if colors.ndim == 0 or colors.shape[-1] != 3:
         raise ValueError(f"rgb: expected shape (..., 3), got {colors.shape}")
     if colors.dtype.kind in "ui":
         raise ValueError(f"rgb: expected numbers from 0 to 1, got {colors.dtype}; divide images by 255")
-    return (colors if colors.dtype in (np.float32, np.float64) else colors.astype(canonical_float())), xp
-
-
-def _parts(colors: Any) -> tuple[Any, Any, Any]:
-    return colors[..., 0], colors[..., 1], colors[..., 2]
+    colors = colors if colors.dtype in (np.float32, np.float64) else colors.astype(canonical_float())
+    return xp.moveaxis(colors, -1, 0), xp
 
 
 def _weighted(weights: Float[np.ndarray, "3"], colors: Any) -> Any:
-    first, second, third = (float(weight) for weight in weights)
-    red, green, blue = _parts(colors)
+    first, second, third = weights.tolist()
+    red, green, blue = colors
     return first * red + second * green + third * blue
