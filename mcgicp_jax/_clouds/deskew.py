@@ -37,8 +37,7 @@ def deskew(cloud: PointCloud, motion: Pose) -> PointCloud:
             "cloud: expected times of its points, PointCloud(points, times=...), got none; preprocess keeps none"
         )
     matrix, dtype = pose_matrix(motion, "motion"), jax.dtypes.canonicalize_dtype(cloud.points.dtype)
-    concrete = is_concrete(matrix)
-    twist = logarithm(np.asarray(matrix)).astype(dtype) if concrete else se3_from_matrix(matrix, dtype).log()
+    twist = logarithm(np.asarray(matrix)).astype(dtype) if is_concrete(matrix) else se3_from_matrix(matrix, dtype).log()
     xp = numpy_for(cloud.points, cloud.times, cloud.origin)
     points = (cloud.points + cloud.origin).astype(dtype)
     (shifts,) = blockwise(_shift, twist, Input(points), Input(cloud.times.astype(dtype)[:, None]))

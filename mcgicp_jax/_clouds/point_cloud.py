@@ -477,7 +477,7 @@ class PointCloud(eqx.Module):
         rotation = xp.asarray(matrix[:3, :3], self.points.dtype)
         points = rotated(np.asarray(self.points), rotation) if xp is np else self.points @ rotation.T
         covariances = None if self.covariances is None else rotation @ self.covariances @ rotation.T
-        offset, origin = matrix[:3, :3] @ self.origin + matrix[:3, 3], self.origin
+        offset = matrix[:3, :3] @ self.origin + matrix[:3, 3]
         far = is_concrete(points, offset) and is_far(np.asarray(offset), float(np.abs(points).max(initial=0)))
         if far and self.deferred_neighbors is None:
             moved = rotated(self.coordinates, np.asarray(matrix[:3, :3], np.float64)) + np.asarray(matrix[:3, 3])
@@ -487,7 +487,7 @@ class PointCloud(eqx.Module):
             origin = np.asarray(offset, np.float64)
         else:
             points = points + xp.asarray(offset, points.dtype)
-            origin = xp.zeros_like(origin)
+            origin = xp.zeros_like(self.origin)
         return self.replace(points=points, covariances=covariances, origin=origin)
 
     @staticmethod

@@ -89,9 +89,7 @@ class VoxelMap:
         # Sum the rows of each voxel, then add the sums to those of the map.
         order = np.argsort(point_keys, kind="stable")
         starts = starts_of(point_keys[order])
-        keys, sums = point_keys[order][starts], rows[finite]
-        if len(starts):
-            sums = np.add.reduceat(sums[order], starts, axis=0)
+        keys, sums = point_keys[order][starts], np.add.reduceat(rows[finite][order], starts, axis=0)
         if self._sums is None:
             self._sums = np.zeros((0, sums.shape[1]))
         places = np.searchsorted(self._keys, keys)
