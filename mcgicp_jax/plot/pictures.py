@@ -187,11 +187,9 @@ def maps(
     if first is None or len(first) < 3:
         raise ValueError("maps: expected at least one cloud, the first with at least 3 points")
     view = drawing.view_onto(np.asarray(first.points), _PIXELS, limits)
-    wide = view.width > 1.5 * view.height
-    shape = (len(drawn), 1) if wide else (1, len(drawn))
-    aspect = view.height / view.width
-    width = _WIDTH if wide else _WIDTH / len(drawn)
-    figure = drawing.new_figure(width * shape[1], (width * aspect + 0.35) * shape[0])
+    shape = (len(drawn), 1) if view.width > 1.5 * view.height else (1, len(drawn))
+    width = _WIDTH / shape[1]
+    figure = drawing.new_figure(width * shape[1], (width * (view.height / view.width) + 0.35) * shape[0])
     for panel, (name, cloud) in zip(figure.subplots(*shape, squeeze=False).ravel(), drawn.items(), strict=True):
         panel.imshow(_shaded(cloud, view), origin="lower", interpolation="nearest", extent=view.extent)
         panel.set_title(name, fontsize="medium")
