@@ -50,8 +50,7 @@ def arrays_of_columns(columns: Columns) -> tuple[Float[np.ndarray, "N 3"], Float
     channels: dict[str, np.ndarray] = {}
     # Exact names before aliases: if a file has intensity and reflectivity, the former becomes "intensity".
     for column in sorted(columns, key=lambda column: column not in ORDER and channel_name(column) in ORDER):
-        name = channel_name(column)
-        if name is not None:
+        if (name := channel_name(column)) is not None:
             column_values = columns[column]
             if column_values.dtype.kind != "f":
                 # Without loss of precision; integer colours are scaled to 0..1.
@@ -74,15 +73,15 @@ def times_of(columns: Columns) -> Shaped[np.ndarray, "N"] | None:
 
 def with_unpacked_colors(columns: Columns) -> Columns:
     """Split the column `rgb`, or else `rgba`, into colours if its four bytes are packed ones, as in PCL."""
-    for packed in columns.keys() & {"rgb"} or columns.keys() & {"rgba"}:
-        if columns[packed].dtype.itemsize == 4:
-            bits = np.ascontiguousarray(columns[packed]).view(np.uint32)
-            colors = {name: (bits >> shift).astype(np.uint8) for name, shift in zip(COLORS, (16, 8, 0), strict=True)}
-            missing = bits == _NO_COLOR
-            if missing.any():
-                colors = {name: np.where(missing, np.nan, values / np.float32(255)) for name, values in colors.items()}
-            columns = {name: values for name, values in columns.items() if name != packed} | colors
-    return columns
+    packed = "rgb" if "rgb" in columns else "rgba"
+    if packed not in columns or columns[packed].dtype.itemsize != 4:
+        return columns
+    bits = np.ascontiguousarray(columns[packed]).view(np.uint32)
+    colors = {name: (bits >> shift).astype(np.uint8) for name, shift in zip(COLORS, (16, 8, 0), strict=True)}
+    missing = bits == _NO_COLOR
+    if missing.any():
+        colors = {name: np.where(missing, np.nan, values / np.float32(255)) for name, values in colors.items()}
+    return {name: values for name, values in columns.items() if name != packed} | colors
 
 
 def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
@@ -99,10 +98,10 @@ def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
         points = points.to_records(index=False)
     if hasattr(points, "point") and hasattr(points.point, "positions"):
         # A cloud of Open3D's tensors.
-        colors = points.point.colors.numpy() if "colors" in points.point else None
-        scale = 255 if colors is not None and colors.dtype == np.uint8 else 1
-        colors = None if colors is None else colors / np.float32(scale)
-        return points.point.positions.numpy(), colors, None if colors is None else COLORS
+        if "colors" not in points.point:
+            return points.point.positions.numpy(), None, None
+        colors = points.point.colors.numpy()
+        return points.point.positions.numpy(), colors / np.float32(255 if colors.dtype == np.uint8 else 1), COLORS
     fields = getattr(getattr(points, "dtype", None), "names", None)
     if fields is not None:
         if not {"x", "y", "z"} <= {field.lower() for field in fields}:

@@ -65,7 +65,7 @@ def columns_of_floats(values: Float[np.ndarray, "n"], width: int | None = None) 
 
 def _step(values: Float[np.ndarray, "n"], size: int) -> float:
     """Median difference of values that are `size` apart."""
-    differences = np.abs(values[size:] - values[: max(values.size - size, 0)])
+    differences = np.abs(values[size:] - values[:-size])
     differences = differences[np.isfinite(differences)]
     return float(np.median(differences)) if differences.size else np.inf
 

@@ -57,12 +57,12 @@ def _pcd_header(file: BinaryIO) -> list[str]:
     in what they may omit: the viewpoint and, in some files, the counts."""
     lines: list[str] = []
     while len(lines) < 10 and not (lines and lines[-1].startswith("DATA")):
-        line = file.readline()
-        if not line:
+        if not (line := file.readline()):
             raise ValueError("no complete PCD header")
-        lines += [text for text in [line.decode("utf-8-sig", "replace").strip()] if text and not text.startswith("#")]
-    lines = [line for line in lines if not line.startswith("VERSION")]
-    columns = {key: values for key, *values in map(str.split, lines)}
+        text = line.decode("utf-8-sig", "replace").strip()
+        if text and not text.startswith("#"):
+            lines.append(text)
+    columns = {key: values for key, *values in map(str.split, lines) if not key.startswith("VERSION")}
     counts = columns.setdefault("COUNT", ["1"] * len(columns.get("FIELDS", [])))
     # Fields without values take no place in the rows.
     filled = [number for number, count in enumerate(counts) if count != "0"]
