@@ -85,7 +85,7 @@ def _known_format(path: Path, columns: int | None = None) -> Format | None:
 
 
 class _Decompressed(io.BytesIO):
-    """With what `BinaryIO` names beside it."""
+    """`BytesIO` with the two attributes of `BinaryIO` that it lacks."""
 
     name, mode = "", "rb"
 

@@ -53,9 +53,8 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         ImportError: if matplotlib is missing.
     """
     if not isinstance(poses, Mapping):
-        raise ValueError(
-            f'poses: expected poses by name, such as {{"GICP": result.matrix}}, got {type(poses).__name__}'
-        )
+        kind = type(poses).__name__
+        raise ValueError(f'poses: expected poses by name, such as {{"GICP": result.matrix}}, got {kind}')
     poses = {"start": np.eye(4)} | dict(poses)
     matrices = [pose_matrix(pose, f"poses[{name!r}]") for name, pose in poses.items()]
     source, target = drawing.drawable(source), drawing.drawable(target)
