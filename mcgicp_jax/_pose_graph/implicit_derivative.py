@@ -144,7 +144,7 @@ def _sensitivity(state: GraphState, result: GraphPoses, dtype: DTypeLike) -> _Se
             values[state.weights > 0] = derivative[state.weights > 0]
         if equations.size:
             # From unknowns to poses: first the rows, then the columns of the inverse.
-            columns = equations.spread(factored(equations.matrix(blocks)).solve(np.eye(equations.size)))
+            columns = equations.spread(factored(equations.matrix(blocks, state.weights)).solve(np.eye(equations.size)))
             inverse = equations.spread(np.moveaxis(columns, 2, 0))
     return _Sensitivity(*(values.astype(dtype) for values in (inverse[:n, :, :n], *by_edge)))
 

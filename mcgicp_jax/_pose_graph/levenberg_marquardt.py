@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Inexact
+from jaxtyping import Bool, Float, Shaped
 
 from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._pose_graph.edge import WORLD, Factors, motion_jacobians
@@ -56,51 +56,49 @@ class NormalEquations:
 
     Attributes:
         factors: all measurements, numbered in this order, the edges first; `rows` (m, 2) and `in_use` (m,) are theirs.
-        place: place of each pose in the elimination order; −1 for `fixed` ones.
+        order: the poses that move, in the elimination order, which is that of the unknowns.
         parts: number of the connected part of each pose.
         root: the fixed pose to which covariances refer: the first one, or the world.
         metric: the sparse matrix D at the initial poses.
     """
 
-    def __init__(self, factors: Factors, poses: Poses, in_use: Mask | None = None):
+    def __init__(self, factors: Factors, poses: Poses, in_use: Mask):
         # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
         from scipy.sparse import coo_array, eye_array
         from scipy.sparse.csgraph import connected_components
 
-        self.factors, self.initial_poses, num_poses = factors, poses, len(poses)
+        self.factors, self.initial_poses, self.in_use, num_poses = factors, poses, in_use, len(poses)
         rows = np.concatenate([np.asarray(factor.rows) for factor in factors])
         self.root = num_poses - 1 if np.any(rows == WORLD) else 0
         self.rows = np.where(rows == WORLD, self.root, rows)
-        self.in_use = np.ones(len(rows), bool) if in_use is None else in_use
         # Row and column, as poses, of the four blocks of each measurement.
         block_rows, block_columns = np.repeat(self.rows, 2, axis=1), np.tile(self.rows, 2)
-        entries = block_rows[self.in_use].ravel(), block_columns[self.in_use].ravel()
+        entries = block_rows[in_use].ravel(), block_columns[in_use].ravel()
         graph = coo_array((np.ones(len(entries[0])), entries), (num_poses, num_poses))
         _, self.parts = connected_components(graph, directed=False)
         first_of_parts = np.unique(self.parts, return_index=True)[1]
         first_of_parts[self.parts[self.root]] = self.root
-        self.fixed = np.zeros(num_poses, bool)
-        self.fixed[first_of_parts] = True
-        self.size = 6 * int((~self.fixed).sum())
-        self.place = np.full(num_poses, -1)
+        self.order = np.delete(np.arange(num_poses), first_of_parts)
+        self.size = 6 * len(self.order)
         if self.size:
             # SuperLU's minimum-degree order has little fill. A dominant diagonal lets the factorisation exist.
-            pattern = graph.tocsr()[~self.fixed][:, ~self.fixed]
+            pattern = graph.tocsr()[self.order][:, self.order]
             pattern.data[:] = -1.0
             dominant = pattern + eye_array(pattern.shape[0]) * (2.0 + np.diff(pattern.indptr).max())
-            self.place[~self.fixed] = factored(dominant.tocsc(), "MMD_AT_PLUS_A").perm_c
+            self.order = self.order[np.argsort(factored(dominant.tocsc(), "MMD_AT_PLUS_A").perm_c)]
+        place = np.full(num_poses, -1)
+        place[self.order] = np.arange(len(self.order))
         # Places of the blocks in compressed rows of blocks; blocks at the same place are summed.
-        rows, columns = self.place[block_rows].ravel(), self.place[block_columns].ravel()
-        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.repeat(self.in_use, 4))
-        self._order = inside[np.lexsort((columns[inside], rows[inside]))]
-        rows, columns = rows[self._order], columns[self._order]
-        new = np.ones(len(rows), bool)
-        new[1:] = (rows[1:] != rows[:-1]) | (columns[1:] != columns[:-1])
-        self._starts, self._columns = np.flatnonzero(new), columns[new].astype(np.int32)
-        counts = np.bincount(rows[new], minlength=self.size // 6)
-        self._pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        rows, columns = place[block_rows].ravel(), place[block_columns].ravel()
+        inside = np.flatnonzero((rows >= 0) & (columns >= 0) & np.repeat(in_use, 4))
+        keys = rows[inside] * num_poses + columns[inside]
+        by_place = np.argsort(keys, kind="stable")
+        self._blocks = inside[by_place]
+        keys, self._starts = np.unique(keys[by_place], return_index=True)
+        self._columns = (keys % num_poses).astype(np.int32)
+        self._pointers = np.searchsorted(keys, num_poses * np.arange(len(self.order) + 1)).astype(np.int32)
         typical = typical_information(factors)[..., None] * np.eye(6)
-        self.metric = self.matrix(normal_blocks(motion_jacobians(poses[self.rows]), typical))
+        self.metric = self.matrix(normal_blocks(motion_jacobians(poses[self.rows]), typical), in_use)
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
         """Views of the values of the measurements of each factor."""
@@ -120,30 +118,23 @@ class NormalEquations:
     def gradient(self, terms: Terms, weights: PerMeasurement) -> Float[np.ndarray, "_"]:
         """g, in the elimination order."""
         weighted = (weights[:, None, None] * terms.gradient).reshape(-1, 6)
-        sums = [np.bincount(self.rows.ravel(), column, len(self.place)) for column in weighted.T]
-        return self.gathered(np.stack(sums, axis=1))
-
-    def gathered(self, rows: Float[np.ndarray, "n *k"]) -> Float[np.ndarray, "_"]:
-        vector = np.empty((self.size // 6, *rows.shape[1:]))
-        vector[self.place[~self.fixed]] = rows[~self.fixed]
-        return vector.reshape(-1)
+        sums = [np.bincount(self.rows.ravel(), column, len(self.parts)) for column in weighted.T]
+        return np.stack(sums, axis=1)[self.order].reshape(-1)
 
     def spread(self, vector: Float[np.ndarray, "_ *k"]) -> Float[np.ndarray, "n 6 *k"]:
         """A vector of the unknowns as rows of all poses, 0 for fixed ones."""
-        rows = np.zeros((len(self.place), 6, *vector.shape[1:]))
-        rows[~self.fixed] = vector.reshape(-1, *rows.shape[1:])[self.place[~self.fixed]]
+        rows = np.zeros((len(self.parts), 6, *vector.shape[1:]))
+        rows[self.order] = vector.reshape(-1, *rows.shape[1:])
         return rows
 
-    def weighted(self, blocks: Float[np.ndarray, "m 2 2 6 6"], weights: Inexact[np.ndarray, "m"]) -> Any:
-        return self.matrix(weights[:, None, None, None, None] * blocks)
-
-    def matrix(self, blocks: Inexact[np.ndarray, "m 2 2 6 6"]) -> Any:
-        """The sparse symmetric sum of the blocks of all measurements; with JᵀΛJ, it is H."""
+    def matrix(self, blocks: Float[np.ndarray, "m 2 2 6 6"], weights: Shaped[np.ndarray, "m"]) -> Any:
+        """The sparse symmetric sum of the weighted blocks of all measurements; with JᵀΛJ, it is H."""
         from scipy.sparse import bsr_array, csc_array
 
         if not self.size:
             return csc_array((0, 0))
-        summed = np.add.reduceat(blocks.reshape(-1, 6, 6)[self._order], self._starts)
+        weighted = weights[:, None, None, None, None] * blocks
+        summed = np.add.reduceat(weighted.reshape(-1, 6, 6)[self._blocks], self._starts)
         matrix = bsr_array((summed, self._columns, self._pointers), (self.size, self.size)).tocsr()
         # Rows of a symmetric matrix are its columns.
         return csc_array((matrix.data, matrix.indices, matrix.indptr), matrix.shape)
@@ -199,8 +190,11 @@ class GraphState(NamedTuple):
     damping: float = _START_DAMPING
 
     @classmethod
-    def at(cls, equations: NormalEquations, weights: PerMeasurement, poses: Poses) -> GraphState:
-        """The equations must be those of the measurements with positive weights."""
+    def at(
+        cls, factors: Factors, weights: PerMeasurement, poses: Poses, initial_poses: Poses | None = None
+    ) -> GraphState:
+        """`initial_poses`: those at which damping measures motions; `poses` by default."""
+        equations = NormalEquations(factors, poses if initial_poses is None else initial_poses, weights > 0)
         return cls(equations, weights, poses, equations.terms(poses))
 
     def weighted(self, weights: PerMeasurement) -> GraphState:
@@ -219,7 +213,7 @@ class GraphState(NamedTuple):
 
     @property
     def hessian(self) -> Any:
-        return self.equations.weighted(self.terms.blocks, self.weights)
+        return self.equations.matrix(self.terms.blocks, self.weights)
 
 
 def minimize(state: GraphState, max_iterations: int) -> GraphState:
@@ -270,7 +264,7 @@ def settle(state: GraphState, is_anchor: Mask) -> Poses:
     equations, last = state.equations, np.inf
     measured, anchored = state.weights * ~is_anchor, _ANCHOR_WEIGHT * is_anchor
     for _ in range(_REFINEMENTS):
-        system = equations.weighted(state.terms.blocks, measured + 1j * anchored)
+        system = equations.matrix(state.terms.blocks, measured + 1j * anchored)
         gradient = equations.gradient(state.terms, measured) + 1j * equations.gradient(state.terms, anchored)
         step = -factored(equations.damped(system)).solve(gradient).real
         largest = np.abs(step).max()

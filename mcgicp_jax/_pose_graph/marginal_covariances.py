@@ -27,7 +27,7 @@ def pose_covariances(state: GraphState) -> Float[np.ndarray, "n 6 6"]:
     if equations.size:
         try:
             factor = factored(equations.damped(state.hessian))
-            covariances[~equations.fixed] = _inverse_blocks(factor)[equations.place[~equations.fixed]]
+            covariances[equations.order] = _inverse_blocks(factor)
         except (RuntimeError, np.linalg.LinAlgError):
             covariances[:] = np.nan
     covariances[equations.parts != equations.parts[equations.root]] = np.diag(np.full(6, np.inf))
@@ -54,8 +54,8 @@ def propagated(
             right = np.zeros((len(state.poses), 6, len(functions), d))
             for row, jacobian in first_and_second:
                 right[row, :, functions] += jacobian.swapaxes(1, 2)
-            gathered = equations.gathered(right.reshape(*right.shape[:2], -1)).reshape(equations.size, -1)
-            solved = equations.spread(solver.solve(gathered)).reshape(right.shape)
+            unknowns = right[equations.order].reshape(equations.size, -1)
+            solved = equations.spread(solver.solve(unknowns)).reshape(right.shape)
             for row, jacobian in first_and_second:
                 covariances[q] += jacobian @ solved[row, :, functions]
     first, second = equations.parts[rows].T

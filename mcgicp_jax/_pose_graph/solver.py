@@ -84,8 +84,7 @@ def solve(
 def covariances_at(poses: lm.Poses, factors: Factors, weights: lm.PerMeasurement) -> Float[np.ndarray, "n 6 6"]:
     with np.errstate(over="ignore", invalid="ignore"):
         centred, factors, _ = _centred(poses, factors)
-        equations = lm.NormalEquations(factors, centred, weights > 0)
-        return uncertainty(lm.GraphState.at(equations, weights, centred))[: len(poses)]
+        return uncertainty(lm.GraphState.at(factors, weights, centred))[: len(poses)]
 
 
 def uncertainty(state: lm.GraphState) -> Float[np.ndarray, "n 6 6"]:
@@ -100,7 +99,7 @@ def uncertainty(state: lm.GraphState) -> Float[np.ndarray, "n 6 6"]:
         return pose_covariances(state)
     accepted = state.weights[: len(anchors)] > 0
     weights = np.append(state.weights, 1.0 * accepted)
-    single = lm.GraphState.at(lm.NormalEquations((*factors, anchors), state.poses, weights > 0), weights, state.poses)
+    single = lm.GraphState.at((*factors, anchors), weights, state.poses)
     double = single._replace(weights=np.append(state.weights, 2.0 * accepted))
     with_single, with_double = pose_covariances(single), pose_covariances(double)
     fraction = _anchor_information(lm.typical_information(factors)[: len(anchors)])[anchors.i != WORLD][0]
@@ -148,8 +147,8 @@ def _centred(poses: lm.Poses, factors: Factors) -> tuple[Float[np.ndarray, "_ 4 
     motions[of_world, :3, 3] -= origin
     if any(np.any(np.asarray(factor.rows) == WORLD) for factor in factors):
         poses = np.concatenate([poses, np.eye(4)[None]])
-    information = np.asarray(edges.information, np.float64)
-    return poses, (Edge(edges.i, edges.j, motions, information, uncertain=edges.uncertain), *others), origin
+    edges = Edge(edges.i, edges.j, motions, edges.information, uncertain=edges.uncertain)
+    return poses, (edges, *others), origin
 
 
 def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
@@ -163,26 +162,24 @@ def _rigid(matrices: np.ndarray) -> Float[np.ndarray, "_ 4 4"]:
 def _minimum(poses: lm.Poses, factors: Factors, anchors: Edge, uncertain: lm.Mask, limit: int) -> lm.GraphState:
     """`_robust_minimum`, with `anchors` if edges have unmeasured directions and the others do not constrain these."""
     if not anchors.information.any():
-        return _robust_minimum(lm.NormalEquations(factors, poses), poses, uncertain, limit)
-    with_anchors = lm.NormalEquations((*factors, anchors), poses)
-    anchored = _robust_minimum(with_anchors, poses, np.append(uncertain, anchors.uncertain), limit)
-    weights = anchored.weights[: len(uncertain)]
-    state = lm.GraphState.at(lm.NormalEquations(factors, poses, weights > 0), weights, anchored.poses)
+        return _robust_minimum(factors, poses, uncertain, limit)
+    anchored = _robust_minimum((*factors, anchors), poses, np.append(uncertain, anchors.uncertain), limit)
+    state = lm.GraphState.at(factors, anchored.weights[: len(uncertain)], anchored.poses, poses)
     state = state._replace(num_iterations=anchored.num_iterations, damping=anchored.damping)
     if not _is_degenerate(state, anchors):
         return lm.minimize(state, limit)
     if anchored.converged:
-        settled = lm.settle(anchored, np.arange(len(with_anchors.rows)) >= len(uncertain))
+        settled = lm.settle(anchored, np.arange(len(anchored.weights)) >= len(uncertain))
         state = state._replace(poses=settled, terms=state.equations.terms(settled), converged=True)
     return state
 
 
-def _robust_minimum(equations: lm.NormalEquations, start: lm.Poses, uncertain: lm.Mask, limit: int) -> lm.GraphState:
+def _robust_minimum(factors: Factors, start: lm.Poses, uncertain: lm.Mask, limit: int) -> lm.GraphState:
     """The minimum over the kept measurements, whose weight is 1; rejected ones have the weight 0."""
     from scipy.special import chdtri
 
-    state = lm.GraphState.at(equations, np.ones(len(uncertain)), start)
-    sizes = [np.full(len(factor.information), factor.information.shape[-1]) for factor in equations.factors]
+    state = lm.GraphState.at(factors, np.ones(len(uncertain)), start)
+    sizes = [np.full(len(factor.information), factor.information.shape[-1]) for factor in factors]
     thresholds = chdtri(np.concatenate(sizes), _LEVEL)
     largest = (state.terms.squares / thresholds)[uncertain].max(initial=0)
     if not largest > 1:
@@ -237,7 +234,7 @@ def _is_degenerate(state: lm.GraphState, anchors: Edge) -> bool:
     hessian, blocks, number = state.hessian, np.zeros_like(state.terms.blocks), len(anchors)
     jacobians = motion_jacobians(state.poses[equations.rows[:number]])
     blocks[:number] = lm.normal_blocks(jacobians, np.asarray(anchors.information)) / _UNCONSTRAINED
-    least = equations.damped(equations.weighted(blocks, state.weights))
+    least = equations.damped(equations.matrix(blocks, state.weights))
     try:
         solver = lm.factored(hessian + least)
     except RuntimeError:
