@@ -108,13 +108,9 @@ def _inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
 
 def _rows_below(entries: list[Int[np.ndarray, "_"]]) -> list[Int[np.ndarray, "_"]]:
     """N of every block: rows with entries in L, and those of its children, which Z[N, N] of the children needs."""
-    from_children: list[list[Any]] = [[] for _ in entries]
-    below = []
-    for k, rows in enumerate(entries):
-        rows = np.unique(np.concatenate([rows, *from_children[k]]))
-        below.append(rows[rows > k])
-        if len(below[k]):
-            from_children[below[k][0]].append(below[k][1:])
-        # Free the memory.
-        from_children[k] = []
+    below = [rows[rows > k] for k, rows in enumerate(entries)]
+    for rows in below:
+        if len(rows) > 1:
+            parent = rows[0]
+            below[parent] = np.union1d(below[parent], rows[1:])
     return below
