@@ -8,15 +8,15 @@ are then made orthonormal, and one for positions (Martinec & Pajdla, CVPR 2007; 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._math.poses import Pose, pose_matrices
 from mcgicp_jax._pose_graph.edge import WORLD, AbstractFactor, Edge, check_rows, checked_edges
 from mcgicp_jax._pose_graph.levenberg_marquardt import factored
@@ -68,17 +68,18 @@ class PoseGraph(eqx.Module):
             for k, edge in enumerate(edges):
                 if not isinstance(edge, Edge) or np.ndim(edge.i):
                     raise ValueError(f"edges[{k}]: expected a single Edge, got {edge!r}")
-            xp = np if is_concrete(*edges) else jnp
+            xp = numpy_for(*edges)
             self.edges = jax.tree.map(lambda *values: xp.stack(values), *edges)
         if np.ndim(self.edges.i) != 1:
             raise ValueError(f"edges: expected one leading axis, got shape {np.shape(self.edges.i)}")
+        matrices: Any = poses
         if poses is None:
-            poses = _initial_poses(self.edges)
+            matrices = _initial_poses(self.edges)
         elif is_concrete(poses):
-            poses = pose_matrices(poses)
-        if np.ndim(poses) != 3 or np.shape(poses)[1:] != (4, 4):  # type: ignore
-            raise ValueError(f"poses: expected at least one pose of shape (4, 4), got shape {np.shape(poses)}")  # type: ignore
-        self.poses = poses  # type: ignore
+            matrices = pose_matrices(poses)
+        elif np.ndim(matrices) != 3 or matrices.shape[1:] != (4, 4):
+            raise ValueError(f"poses: expected at least one pose of shape (4, 4), got shape {np.shape(matrices)}")
+        self.poses = matrices
         if is_concrete(self.edges):
             self.edges = checked_edges(self.edges, len(self.poses))
         for k, factor in enumerate(factors):
@@ -137,11 +138,22 @@ def _chordal_relaxation(
     ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], roots: Float[np.ndarray, "m 2"], n: int
 ) -> Float[np.ndarray, "n 4 4"]:
     """`roots`: square roots of the information in translation and in rotation."""
+    from scipy.sparse import bsr_array
+
+    def least_squares(blocks: Float[np.ndarray, "m 2 b b"], right: np.ndarray, world: np.ndarray) -> np.ndarray:
+        """The solution of a sparse system with two blocks in each row, for the last pose `world`."""
+        m, _, b, _ = blocks.shape
+        pointers = 2 * np.arange(m + 1)
+        matrix = bsr_array((blocks.reshape(-1, b, b), ends.ravel(), pointers), (b * m, b * (n + 1))).tocsc()
+        free, right = matrix[:, : b * n], right - matrix[:, b * n :] @ world
+        solver = factored((free.T @ free).tocsc(), "MMD_AT_PLUS_A")
+        return np.concatenate([solver.solve(free.T @ right), world])
+
     # R_jᵀ = R_i_jᵀ R_iᵀ, for the three columns at once.
     transposed = motions[:, :3, :3].swapaxes(1, 2)
     identities = np.broadcast_to(np.eye(3), transposed.shape)
     blocks = roots[:, 1, None, None, None] * np.stack([-transposed, identities], axis=1)
-    columns = _least_squares(blocks, ends, np.zeros((3 * len(ends), 3)), np.eye(3), n)
+    columns = least_squares(blocks, np.zeros((3 * len(ends), 3)), np.eye(3))
     left, _, right = np.linalg.svd(columns.reshape(n + 1, 3, 3).swapaxes(1, 2))
     left[:, :, 2] *= np.linalg.det(left @ right)[:, None]
     rotations = left @ right
@@ -150,23 +162,5 @@ def _chordal_relaxation(
     steps = roots[:, :1] * np.einsum("mij,mj->mi", rotations[ends[:, 0]], motions[:, :3, 3])
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[:, :3, :3] = rotations[:-1]
-    poses[:, :3, 3] = _least_squares(blocks, ends, steps, np.zeros((1, 3)), n)[:-1]
+    poses[:, :3, 3] = least_squares(blocks, steps, np.zeros((1, 3)))[:-1]
     return poses
-
-
-def _least_squares(
-    blocks: Float[np.ndarray, "m 2 b b"],
-    ends: Int[np.ndarray, "m 2"],
-    right: Float[np.ndarray, "_ 3"],
-    last: Float[np.ndarray, "b 3"],
-    n: int,
-) -> Float[np.ndarray, "_ 3"]:
-    """Least-squares solution of a sparse system with two blocks in each row; the `last` unknowns are given."""
-    from scipy.sparse import bsr_array
-
-    m, _, b, _ = blocks.shape
-    pointers = 2 * np.arange(m + 1)
-    matrix = bsr_array((blocks.reshape(-1, b, b), ends.ravel(), pointers), (b * m, b * (n + 1))).tocsc()
-    free, right = matrix[:, : b * n], right - matrix[:, b * n :] @ last
-    solver = factored((free.T @ free).tocsc(), "MMD_AT_PLUS_A")
-    return np.concatenate([solver.solve(free.T @ right), last])
