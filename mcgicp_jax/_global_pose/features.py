@@ -23,8 +23,8 @@ from mcgicp_jax._compute.messages import optional_module
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.tables import BLOCK, blocks
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches
-from mcgicp_jax._local_geometry.local_geometry import Offsets, weighted_covariance
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, neighborhoods, with_near
+from mcgicp_jax._local_geometry.local_geometry import offsets_of, weighted_covariance
+from mcgicp_jax._local_geometry.neighborhoods import neighborhoods, with_near
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
@@ -50,8 +50,7 @@ _MAX_PIXELS = 4.0
 
 def normals_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 3"]:
     """Unit normals of arbitrary sign."""
-    (normals,) = blockwise(_normals, np.float32(_NORMAL_RADIUS * voxel_size), *with_near(cloud, False))
-    return normals
+    return blockwise(_normals, np.float32(_NORMAL_RADIUS * voxel_size), *with_near(cloud, False))[0]
 
 
 def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_size: float) -> Float[np.ndarray, "N 33"]:
@@ -68,8 +67,7 @@ def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_si
 
 def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N D"]:
     """Mean and standard deviation of each channel within each radius; NaN where no point has the channel."""
-    (statistics,) = blockwise(_statistics, np.float32(voxel_size), *with_near(cloud, True))
-    return statistics
+    return blockwise(_statistics, np.float32(voxel_size), *with_near(cloud, True))[0]
 
 
 def comparable(
@@ -96,14 +94,10 @@ def comparable(
     return source, target
 
 
-def _offsets(around: Neighborhoods) -> tuple[Offsets, Float[Array, "k n"]]:
-    x, y, z = around.offset(0), around.offset(1), around.offset(2)
-    return (x, y, z), x * x + y * y + z * z
-
-
 def _normals(radius: Float[AnyScalar, ""], points: Rows, neighbors: Rows) -> tuple[Float[Array, "n 3"]]:
     around = neighborhoods(points, neighbors)
-    offsets, square = _offsets(around)
+    offsets = offsets_of(around)
+    square = alg.dot(offsets, offsets)
     weights = (around.present & (square <= radius * radius)).astype(square.dtype)
     return (alg.smallest_eigenvector(weighted_covariance(offsets, weights)).T,)
 
@@ -118,7 +112,8 @@ def _simple_histograms(
     and w = u × v. The angles are α = v·n, φ = u·d and θ = atan2(w·n, u·n).
     """
     around = neighborhoods(points, neighbors)
-    offsets, square = _offsets(around)
+    offsets = offsets_of(around)
+    square = alg.dot(offsets, offsets)
     near = around.present & (square > 0) & (square <= radius * radius)
     distance = jnp.sqrt(jnp.where(near, square, 1))
     line = [offset / distance for offset in offsets]
@@ -160,7 +155,8 @@ def _histogram(values: Float[Array, "k n"], counted: Array) -> Float[Array, "n 1
 
 def _statistics(voxel_size: Float[AnyScalar, ""], points: Rows, neighbors: Rows) -> tuple[Float[Array, "n D"]]:
     around = neighborhoods(points, neighbors)
-    _, square = _offsets(around)
+    offsets = offsets_of(around)
+    square = alg.dot(offsets, offsets)
     columns = []
     for channel in range(around.num_channels):
         valid, difference, here = around.measured(channel), around.difference(channel), around.own_channels[channel]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -25,9 +25,6 @@ from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import is_usable
 from mcgicp_jax._search.kd_tree import nearest_in_position
-
-# Source rows and target rows of the matches.
-RowMatches: TypeAlias = tuple[Any, Any]
 
 # Maximum number of voxels of the smaller and of the larger cloud, and as a fraction of the points. With 6,000 voxels a
 # scene has about a thousand mutual matches; 5,000 to 8,000 register the same real pairs. 20,000 bound the time. With
@@ -141,7 +138,7 @@ def global_pose(
     target: PointCloud | Values,
     *,
     voxel_size: float | None = None,
-    correspondences: RowMatches | None = None,
+    correspondences: tuple[Any, Any] | None = None,
 ) -> GlobalPoseResult:
     """Estimate the pose between two clouds without an initial pose. To refine it, pass its `matrix` to `register`.
 
