@@ -59,8 +59,10 @@ def register(
 
     The coarse phase may leave a right `init`, for instance where clouds were cut out of merged scans. If `max_distance`
     is None, and it has moved the points by more than the fine distance to a pose at which the surfaces do not coincide,
-    a second registration from `init` uses the fine distance alone, and is the result if they coincide better. Not
-    inside transformations: pass `max_distance` there if `init` is near.
+    a second registration from `init` uses the fine distance alone, and is the result if they coincide better. With
+    fewer than 4,000 matches, a DEGENERATE pose, or one more than half of the coarse distance away, is compared in any
+    case: where surfaces coincide at a nearer pose, too, and channels do not decide, that one is the result if the pose
+    is DEGENERATE, and else it is UNVERIFIED. Not inside transformations: pass `max_distance` there if `init` is near.
 
     Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches
@@ -85,12 +87,13 @@ def register(
         init: initial T_target_source, `jaxlie.SE3` or (4, 4); the identity by default. "global": the pose found by
             `global_pose`. If it does not succeed, the status is UNVERIFIED, or if it finds no pose at all,
             TOO_FEW_CORRESPONDENCES, and the pose NaN. "global" is not available inside transformations.
-        max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. One number,
-            or two: for the coarse and for the fine phase. None: 10 and 2.5 times the spacing of the target (its median
-            nearest-neighbour distance, or the edge of its cells); the first is also at least 10 times the spacing of a
-            square grid of the target's density, as the lines of LiDAR scans are far apart. Pass a larger value if
-            `init` is further off. With "global" and with a prior, it is at most a voxel of `global_pose`, or three
-            standard deviations of the prior beside the distance from its pose to `init`.
+        max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. Two numbers,
+            for the coarse and for the fine phase, or one for both: points without a partner then pull the pose. None:
+            10 and 2.5 times the spacing of the target (its median nearest-neighbour distance, or the edge of its
+            cells); the first is also at least 10 times the spacing of a square grid of the target's density, as the
+            lines of LiDAR scans are far apart. Pass a larger first one if `init` is further off. With "global" and with
+            a prior, it is at most a voxel of `global_pose`, or three standard deviations of the prior beside the
+            distance from its pose to `init`.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
