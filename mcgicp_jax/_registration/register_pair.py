@@ -364,10 +364,8 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
         best = i if fit.exceeds(fits[best], BETTER) else best
 
     def is_nearer(i: int) -> bool:
-        """Whether surfaces coincide at a pose nearer to the initial one, and channels do not tell it from the best."""
-        directions = cast(Directions, runs[best].loop.state.directions)
-        by_shape = doubt.few and not np.any(directions.constrained_by_channels)
-        return by_shape and moved[i] < moved[best] - fine and bool(fits[i].fit > GOOD_FIT)
+        """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone tells."""
+        return doubt.by_shape and moved[i] < moved[best] - fine and bool(fits[i].fit > GOOD_FIT)
 
     # Along what nothing constrains, the pose keeps its initial value.
     if runs[best].loop.state.status == Status.DEGENERATE:

@@ -45,11 +45,12 @@ BETTER = 1.3
 # Of 576 registrations of such rooms, 22 were CONVERGED and off by more than six deviations with a second one alone, and
 # now two.
 CLOSE = 0.6
-# With few matches, a pose further from the initial one than this fraction of the coarse `max_distance`, which says how
-# far off that may be, is compared however well surfaces coincide, and so is a DEGENERATE one. In a corridor they do at
-# many poses, and more points have matches where one cloud lies over the other. Of 288 registrations of 300 to 3,000
-# points of corridors and rooms, half to three quarters in common, from starts within 0.3 m, 50 were CONVERGED and off
-# by more than six deviations, and now 14; 37 were DEGENERATE and had slid by more than 0.5 m, and now 11.
+# With few matches, a pose that no channel constrains, and that is further from the initial one than this fraction of
+# the coarse `max_distance`, which says how far off that may be, is compared however well surfaces coincide, and so is a
+# DEGENERATE one. In a corridor they do at many poses, and more points have matches where one cloud lies over the other.
+# Of 288 registrations of 300 to 3,000 points of corridors and rooms, half to three quarters in common, from starts
+# within 0.3 m, 50 were CONVERGED and off by more than six deviations, and now 14; 37 were DEGENERATE and had slid by
+# more than 0.5 m, and now 11.
 FAR = 0.5
 # Fraction of the source points that lie on the target, in position, below which views have little in common. A pose at
 # which more points lie on surfaces may then win, though these coincide: of 160 views of rooms from 46 to 63° apart, six
@@ -87,12 +88,14 @@ class Doubt(NamedTuple):
         moved: how far it has moved the points, metres.
         little: whether the views have little in common.
         few: whether there are few matches.
+        by_shape: whether there are, and no channel constrains the pose.
     """
 
     fit: SurfaceFit
     moved: float
     little: bool
     few: bool
+    by_shape: bool
 
 
 def doubt_of_start(
@@ -116,9 +119,10 @@ def doubt_of_start(
     fit = measure_fit()
     few = bool(state.record.num_inliers < _MANY)
     little = bool(fit.overlap < LITTLE_IN_COMMON) and not at_scales
+    by_shape = few and not np.any(cast(Directions, state.directions).constrained_by_channels)
     far = moved > FAR * settings.max_distance or state.status == Status.DEGENERATE
-    doubtful = fit.fit < (GOOD_FIT if few else LEAST_FIT) or little or (few and far and not at_scales)
-    return Doubt(fit, moved, little, few) if doubtful else None
+    doubtful = fit.fit < (GOOD_FIT if few else LEAST_FIT) or little or (by_shape and far and not at_scales)
+    return Doubt(fit, moved, little, few, by_shape) if doubtful else None
 
 
 def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> SurfaceFit:
