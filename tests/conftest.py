@@ -6,7 +6,7 @@ import os
 import pathlib
 
 # Compilation takes most of the tests' time, and on CPUs four times as much where it optimizes. Unless XLA_FLAGS is set,
-# the tests do without; CI runs what users run, and all quick tests once more, with it.
+# the tests do without. CI sets it for the slow tests of what users run, and for a second run of all quick tests.
 # XLA aborts at flags that it does not know; jaxlib 0.11.1 no longer knows the second one.
 os.environ.setdefault(
     "XLA_FLAGS",

@@ -56,6 +56,7 @@ from mcgicp_jax._registration.start_check import (
     CLOSE,
     GOOD_FIT,
     LITTLE_IN_COMMON,
+    SurfaceFit,
     distance_moved,
     doubt_of_start,
     surface_fit,
@@ -339,6 +340,16 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
 
+class _Candidate(NamedTuple):
+    """A registration from the initial pose, how its surfaces coincide, how far it has moved the points (metres), and
+    the `max_distance` that it used, for messages."""
+
+    run: Run
+    fit: SurfaceFit
+    moved: float
+    max_distance: str
+
+
 def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable[[float], Run]) -> tuple[Run, str]:
     """The registration, or `closely(max_distance)` from the same start if it may have left a right initial pose and
     surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing."""
@@ -348,44 +359,42 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
     doubt = doubt_of_start(start, state, settings, partial(surface_fit, run.inputs, executor, run.loop), at_scales)
     if doubt is None:
         return run, ""
-    # All are measured within the same distance.
     fine = float(settings.fine_distance)
-    runs, fits, moved = [run], [doubt.fit], [doubt.moved]
-    distances = [f"({float(settings.max_distance):.2g}, {fine:.2g})"]
+    best = _Candidate(run, doubt.fit, doubt.moved, f"({float(settings.max_distance):.2g}, {fine:.2g})")
+    candidates = [best]
     for distance in (fine, CLOSE * fine) if doubt.few and not doubt.little else (fine,):
-        other = closely(distance)
-        if other.loop.state.status in USABLE:
-            runs.append(other)
-            fits.append(surface_fit(run.inputs, executor, other.loop))
-            moved.append(distance_moved(start, other.loop.state))
-            distances.append(f"{distance:.2g}")
-    best = 0
-    for i, fit in enumerate(fits):
-        best = i if fit.exceeds(fits[best], BETTER) else best
+        other_run = closely(distance)
+        if other_run.loop.state.status in USABLE:
+            # All are measured within the same distance.
+            fit, moved = surface_fit(run.inputs, executor, other_run.loop), distance_moved(start, other_run.loop.state)
+            candidates.append(_Candidate(other_run, fit, moved, f"{distance:.2g}"))
+    for other in candidates:
+        best = other if other.fit.exceeds(best.fit, BETTER) else best
 
-    def is_nearer(i: int) -> bool:
-        """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone tells."""
-        return doubt.by_shape and moved[i] < moved[best] - fine and bool(fits[i].fit > GOOD_FIT)
+    def is_nearer(other: _Candidate) -> bool:
+        """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone decides."""
+        return doubt.by_shape and other.moved < best.moved - fine and bool(other.fit.fit > GOOD_FIT)
 
     # Along what nothing constrains, the pose keeps its initial value.
-    if runs[best].loop.state.status == Status.DEGENERATE:
-        best = next(filter(is_nearer, range(len(runs))), best)
+    if best.run.loop.state.status == Status.DEGENERATE:
+        best = next(filter(is_nearer, candidates), best)
     margin = 1 / BETTER if doubt.few else 1.0
-    rivals = [i for i, fit in enumerate(fits) if doubt.little or fit.exceeds(fits[best], margin) or is_nearer(i)]
-    apart = {i: distance_moved(runs[best].loop.state.pose, runs[i].loop.state) for i in rivals}
-    rival = max(rivals, key=apart.__getitem__, default=best)
+    rivals = [other for other in candidates if doubt.little or other.fit.exceeds(best.fit, margin) or is_nearer(other)]
+    distances = [distance_moved(best.run.loop.state.pose, rival.run.loop.state) for rival in rivals]
+    apart = max(distances, default=0.0)
     common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
     reason = ""
-    if doubt.little and len(runs) == 1:
-        reason = f"{common}registration with a smaller max_distance fails; try a better initial pose"
-    elif apart.get(rival, 0.0) > fine:
+    if doubt.little and len(candidates) == 1:
+        reason = f"{common}registration with a smaller max_distance fails; pass a better initial pose"
+    elif apart > fine:
+        rival = rivals[distances.index(apart)]
+        coincide = "" if doubt.little else ", at which surfaces coincide about as well"
         reason = (
-            f"{common}max_distance={distances[best]} leads to this pose, {moved[best]:.2g} m from the initial one, and "
-            f"{distances[rival]} to one {apart[rival]:.2g} m away from it"
+            f"{common}max_distance={best.max_distance} leads to this pose, {best.moved:.2g} m from the initial one, "
+            f"and max_distance={rival.max_distance} to another one, {apart:.2g} m away{coincide}; pass "
+            f"max_distance={candidates[-1].max_distance} if the initial pose is good to {fine:.2g} m, or a better init"
         )
-        reason += "" if doubt.little else ", at which surfaces coincide about as well"
-        reason += f"; if the initial pose is good to {fine:.2g} m, pass max_distance={distances[-1]}, else a better one"
-    return runs[best], reason
+    return best.run, reason
 
 
 def _equalized(inputs: Inputs, matches: Correspondences | None = None) -> Inputs:

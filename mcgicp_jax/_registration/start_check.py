@@ -45,12 +45,12 @@ BETTER = 1.3
 # Of 576 registrations of such rooms, 22 were CONVERGED and off by more than six deviations with a second one alone, and
 # now two.
 CLOSE = 0.6
-# With few matches, a pose that no channel constrains, and that is further from the initial one than this fraction of
-# the coarse `max_distance`, which says how far off that may be, is compared however well surfaces coincide, and so is a
-# DEGENERATE one. In a corridor they do at many poses, and more points have matches where one cloud lies over the other.
-# Of 288 registrations of 300 to 3,000 points of corridors and rooms, half to three quarters in common, from starts
-# within 0.3 m, 50 were CONVERGED and off by more than six deviations, and now 14; 37 were DEGENERATE and had slid by
-# more than 0.5 m, and now 11.
+# With few matches and no channel that constrains the pose, a DEGENERATE pose, or one that is further from the initial
+# pose than this fraction of the coarse `max_distance`, is compared however well its surfaces coincide: in a corridor
+# they coincide at many poses, and more points have matches where one cloud lies over the other. Of 288 registrations of
+# 300 to 3,000 points of corridors and rooms, half to three quarters in common, from starts within 0.3 m, 50 were
+# CONVERGED and off by more than six deviations, and now 14; 37 were DEGENERATE and had slid by more than 0.5 m, and now
+# 11.
 FAR = 0.5
 # Fraction of the source points that lie on the target, in position, below which views have little in common. A pose at
 # which more points lie on surfaces may then win, though these coincide: of 160 views of rooms from 46 to 63° apart, six
@@ -88,7 +88,7 @@ class Doubt(NamedTuple):
         moved: how far it has moved the points, metres.
         little: whether the views have little in common.
         few: whether there are few matches.
-        by_shape: whether there are, and no channel constrains the pose.
+        by_shape: whether there are few matches, and no channel constrains the pose.
     """
 
     fit: SurfaceFit
@@ -108,8 +108,8 @@ def doubt_of_start(
     """The doubt of a registration, if there is any; `measure_fit` computes the `surface_fit` at its pose.
 
     It may have left a right initial pose if it has moved the points by more than the fine `max_distance`, and surfaces
-    do not coincide at its pose, or have little in common, or it has moved them far, or along a direction that nothing
-    constrains. (At several scales the initial pose is known to be far off, where the fine distance leads nowhere.)
+    do not coincide at its pose, or have little in common; and if shape alone decides, also if it has moved them far, or
+    is DEGENERATE. (At several scales the initial pose is known to be far off, where the fine distance leads nowhere.)
     """
     if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
         return None
