@@ -39,6 +39,15 @@ def test_a_right_initial_pose_is_kept(count, seed, common):
             np.testing.assert_array_equal(same.matrix, result.matrix)
 
 
+@pytest.mark.parametrize(("count", "seed", "common"), LEFT[:3])
+def test_a_right_initial_pose_is_kept_with_given_distances(count, seed, common):
+    pair = office(seed, count, common)
+    result = mcg.register(pair.source, pair.target, GICP, max_distance=(1.5, 0.2))
+    assert result.status is Status.UNVERIFIED or error(result) < 0.08
+    (same,) = mcg.register_batch([pair.source], [pair.target], GICP, max_distance=(1.5, 0.2))
+    assert same.status is result.status
+
+
 # Rooms whose spacing is nearly that of the furniture, so that the default distances lead to poses 1 to 2 m off.
 SPARSE = [(330, 2, 0.67), (330, 13, 0.8), (330, 25, 0.5), (500, 8, 0.5), (500, 10, 0.5), (500, 25, 0.5)]
 
@@ -66,7 +75,7 @@ def test_scan_lines_that_match_themselves_do_not_hold_the_initial_pose(data):
 def test_a_pose_is_unverified_if_another_one_explains_the_surfaces_as_well():
     """A sparse room, 1 m off, where the surfaces coincide as well as at the truth, where the pose begins."""
     pair = office(9, 1000)
-    with pytest.warns(UserWarning, match=r" m away, at which surfaces coincide about as well; pass max_distance="):
+    with pytest.warns(UserWarning, match=" m from this one, at which surfaces coincide about as well; pass "):
         result = mcg.register(pair.source, pair.target, GICP)
     assert error(result) > 0.5 and result.status is Status.UNVERIFIED
 
@@ -89,7 +98,7 @@ def test_a_degenerate_pose_keeps_its_initial_value(count, seed, low):
 
 @pytest.mark.parametrize(("count", "seed"), [(300, 1), (600, 0)])
 def test_a_pose_far_from_the_initial_one_is_unverified_if_surfaces_coincide_near_it(count, seed):
-    with pytest.warns(UserWarning, match=r"4\.\d m away, at which surfaces coincide about as well"):
+    with pytest.warns(UserWarning, match=r"4\.\d m from this one, at which surfaces coincide about as well"):
         result = mcg.register(corridor(count, 5, 16, 2 * seed + 1), corridor(count, 0, 11, 2 * seed), GICP)
     assert result.status is Status.UNVERIFIED
 

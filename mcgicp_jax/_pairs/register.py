@@ -57,13 +57,13 @@ def register(
     A coarse phase uses the larger `max_distance`, and of 8,192 source points or more an even subset of at least 4,096.
     Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
 
-    The coarse phase may leave a right `init`, for instance where clouds were cut out of merged scans. If `max_distance`
-    is None, and it has moved the points by more than the fine distance to a pose at which the surfaces do not coincide,
-    a second registration from `init` uses the fine distance alone, and is the result if they coincide better. With
-    fewer than 4,000 matches, and no channel that constrains the pose, there is also a second registration if the first
-    one is DEGENERATE, or has moved the points by more than half of the coarse distance. If the surfaces coincide at a
-    pose nearer to `init`, too, this pose replaces a DEGENERATE one, and any other pose is UNVERIFIED. None of this is
-    done inside transformations: pass `max_distance` there if `init` is near.
+    The coarse phase may leave a right `init`, for instance where clouds were cut out of merged scans. If it has moved
+    the points by more than the fine distance to a pose at which the surfaces do not coincide, a second registration
+    from `init` uses the fine distance alone, and is the result if they coincide better. With fewer than 4,000 matches,
+    and no channel that constrains the pose, there is also a second registration if the first one is DEGENERATE, or has
+    moved the points by more than half of the coarse distance. If the surfaces coincide at a pose nearer to `init`, too,
+    this pose replaces a DEGENERATE one, and any other pose is UNVERIFIED. None of this is done inside transformations:
+    pass a small `max_distance` there if `init` is near.
 
     Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches

@@ -238,7 +238,7 @@ class _Group(Generic[Key]):
 
 
 def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
-    """Whether there is a `doubt_of_start`, by settings and fit; None if `max_distance` is given."""
+    """Whether there is a `doubt_of_start`, by settings and fit; None for a single `max_distance`."""
     return check is not None and doubt_of_start(start, state, check[0], lambda: check[1]) is not None
 
 
@@ -287,7 +287,7 @@ def _registered(
         problem = replace(problem, start=pair.start)
         executor = TracedExecutor(problem, search, options.max_iterations)
         loop = executor.run(max_updates)
-        check = (problem.settings, surface_fit(inputs, executor, loop)) if complete.max_distance is None else None
+        check = (problem.settings, surface_fit(inputs, executor, loop)) if complete.has_two_distances else None
         assessment = assess(loop, problem, search) if covariances else Assessment.without_covariance(loop.state)
         return loop.state, assessment, loop.history, check
 

@@ -7,7 +7,7 @@ import inspect
 import reprlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias, TypedDict, cast
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -89,6 +89,11 @@ class Options:
         """The options that may be arrays, constants to autodiff."""
         names = ("max_distance", "translation_tolerance", "rotation_tolerance", "hold_unconstrained")
         return {name: getattr(self, name) for name in names}
+
+    @property
+    def has_two_distances(self) -> bool:
+        """Whether the coarse and the fine `max_distance` are two numbers, given or by default."""
+        return self.max_distance is None or np.shape(cast(Any, self.max_distance)) != ()
 
     def takes_raw(self, method: AbstractMethod, name: str) -> bool:
         """Whether the method makes its cells of the cloud "source" or "target" itself, of all points."""

@@ -194,8 +194,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         start = _final_pose(run) if run.loop.state.status in USABLE else start
     run = solve(inputs, start)
     doubt = ""
-    # A given coarse distance says how far off the initial pose may be.
-    if not traced and options.max_distance is None:
+    if not traced and options.has_two_distances:
         run, doubt = _unless_left(
             run, init, len(coarse) > 0, lambda limit: solve(inputs, init, replace(options, max_distance=limit))
         )
@@ -388,11 +387,13 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
         reason = f"{common}registration with a smaller max_distance fails; pass a better initial pose"
     elif apart > fine:
         rival = rivals[distances.index(apart)]
+        nearest = min(best, rival, key=lambda candidate: candidate.moved)
         coincide = "" if doubt.little else ", at which surfaces coincide about as well"
         reason = (
-            f"{common}max_distance={best.max_distance} leads to this pose, {best.moved:.2g} m from the initial one, "
-            f"and max_distance={rival.max_distance} to another one, {apart:.2g} m away{coincide}; pass "
-            f"max_distance={candidates[-1].max_distance} if the initial pose is good to {fine:.2g} m, or a better init"
+            f"{common}max_distance={best.max_distance} leads from the initial pose to this one, "
+            f"{best.moved:.2g} m away, and max_distance={rival.max_distance} to another, {apart:.2g} m from this one"
+            f"{coincide}; pass max_distance={nearest.max_distance} if the initial pose is good to {fine:.2g} m, or a "
+            "better init"
         )
     return best.run, reason
 
