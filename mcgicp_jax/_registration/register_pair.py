@@ -217,6 +217,10 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
             settings = settings._replace(max_distance=settings.fine_distance)
         problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
         run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
+        if doubt and distance_moved(problem.start, run.loop.state) > settings.fine_distance:
+            # The doubt was about another pose. It holds for this one, too, if the views have little in common at it.
+            fit = surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop)
+            doubt = doubt if fit.overlap < LITTLE_IN_COMMON else ""
     if traced:
         return run
     status = run.loop.state.status
@@ -229,7 +233,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         run = run._replace(doubt=doubt)
     elif not measures and status == Status.DEGENERATE and run.loop.state.directions is not None:
         _warn_of_near_points(run)
-    elif not measures and status == Status.CONVERGED and doubt:
+    elif status == Status.CONVERGED and doubt:
         state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
         doubt = f"the pose is UNVERIFIED: {doubt}"
         run = run._replace(loop=run.loop._replace(state=state), doubt=doubt)
