@@ -118,6 +118,7 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     rows = {row["source"]: row for row in table(output)}
     assert rows["scan_1.ply"]["status"] == "converged"
     assert rows["scan_2.ply"]["status"] == "too_few_correspondences"
+    assert "fewer than four points have a match" in rows["scan_2.ply"]["reason"]
     for name in ("missing.ply", "notes.txt"):
         assert rows[name]["status"] == "invalid_input" and name in rows[name]["reason"]
     text, errors = capsys.readouterr()
@@ -126,6 +127,15 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     # Files that cannot be read have no rate.
     assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1
     assert "done:      2 of 2\n" in capsys.readouterr().out
+
+
+def test_a_degenerate_pair_names_its_unconstrained_directions(tmp_path):
+    for seed in range(2):
+        noise = np.random.default_rng(seed).normal(size=(1000, 3))
+        io.write(tmp_path / f"floor_{seed}.ply", mcg.PointCloud(noise * [1, 1, 0.01]))
+    assert main(["batch", str(tmp_path), "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 1
+    (row,) = table(tmp_path / "results.csv")
+    assert row["status"] == "degenerate" and row["reason"].startswith("unconstrained: translation along (")
 
 
 def test_a_pair_from_several_starts(folder, tmp_path, capsys):

@@ -68,11 +68,11 @@ class Status(enum.IntEnum):
 _ADVICE = {
     Status.CONVERGED: "",
     Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
-    "try a larger max_iterations, or init with a better initial pose",
+    "try init with a better initial pose, other max_distance, or a larger max_iterations",
     Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
     "are both clouds in metres? If so, try init with a pose at which they overlap, or a larger max_distance",
-    Status.DEGENERATE: "the pose is unconstrained in at least one direction; "
-    "try clouds that show more of the scene, or MC-GICP and clouds with channels",
+    Status.DEGENERATE: "the pose is unconstrained in at least one direction; try clouds that show more of the scene, "
+    "or MC-GICP and clouds with channels, or fix that direction if the initial pose is right in it",
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
