@@ -42,6 +42,19 @@ def test_points_are_where_the_sensor_would_have_seen_them_at_the_end():
     refused(lambda: mcg.deskew(cloud, 2 * motion()), "motion")
 
 
+@pytest.mark.parametrize("placeholder", [0.0, 999.0])
+def test_rows_without_return_stay_where_they_are(placeholder):
+    still, cloud = scan()
+    points = np.concatenate([cloud.points, np.full((30, 3), placeholder)])
+    times = np.concatenate([cloud.times, np.linspace(cloud.times.min(), cloud.times.max(), 30)])
+    moved = mcg.deskew(mcg.PointCloud(points, times=times), motion())
+    # One zero may be a measurement.
+    assert (moved.points[301:] == placeholder).all()
+    with pytest.warns(UserWarning, match=r"left out (28|30) of 330 points"):
+        left = mcg.preprocess(moved, None)
+    np.testing.assert_allclose(left.points[:300], still, atol=1e-5)
+
+
 @pytest.mark.slow
 @in_float64
 @pytest.mark.parametrize("transformation", [lambda gradient: gradient, jax.jit])

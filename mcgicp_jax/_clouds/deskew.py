@@ -7,11 +7,17 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
+from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
+from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, logarithm, pose_matrix, se3_from_matrix
+
+# Odometry deskews a scan up to three times.
+_measured_rows = cached_with_cloud(measured_rows)
 
 
 @with_settings_of_package
@@ -19,7 +25,8 @@ def deskew(cloud: PointCloud, motion: Pose) -> PointCloud:
     """Move the points of a scan to where the sensor would have measured them at the end of the scan.
 
     The sensor is taken to move with constant velocity: a point of the time s, from 0 to 1, moves by exp((s − 1) ξ),
-    ξ = log(motion). Differentiable by the motion, the points and the times, outside of `jit` and inside.
+    ξ = log(motion). Differentiable by the motion, the points and the times, outside of `jit` and inside. Outside of it,
+    rows that sensors report for rays without return stay where they are, so that `preprocess` finds them.
 
     Args:
         cloud: a raw scan with `times`, in the frame of the sensor.
@@ -38,9 +45,11 @@ def deskew(cloud: PointCloud, motion: Pose) -> PointCloud:
         )
     matrix, dtype = pose_matrix(motion, "motion"), jax.dtypes.canonicalize_dtype(cloud.points.dtype)
     twist = logarithm(np.asarray(matrix)).astype(dtype) if is_concrete(matrix) else se3_from_matrix(matrix, dtype).log()
-    xp = numpy_for(cloud.points, cloud.times, cloud.origin)
     points = (cloud.points + cloud.origin).astype(dtype)
     (shifts,) = blockwise(_shift, twist, Input(points), Input(cloud.times.astype(dtype)[:, None]))
+    values, xp = primal(cloud), numpy_for(cloud.points, shifts)
+    if is_concrete(values):
+        shifts = xp.where(_measured_rows(values)[:, None], shifts, 0)
     return cloud.replace_rows(points=xp.asarray(cloud.points) + shifts, times=None)
 
 
