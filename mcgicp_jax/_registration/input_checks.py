@@ -44,7 +44,6 @@ def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod)
             raise ValueError(
                 f"{name}: expected a single cloud, got shape {cloud.points.shape}; use jax.vmap for a batch"
             )
-    for name, cloud in (("source", source), ("target", target)):
         if name in method.needs_covariances and cloud.covariances is None:
             raise ValueError(
                 f"{name}: expected a cloud with covariances for {type(method).__name__}; make it with "

@@ -24,7 +24,7 @@ from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status
 
 # Least overlap of a registration that becomes an edge: with less, a wrong local minimum looks like a right one.
-LEAST_OVERLAP = 0.4
+LEAST_OVERLAP_OF_LOOP = 0.4
 # Standard deviation assumed along unconstrained directions: the length of the motion, and at least this number of point
 # spacings, the default coarse distance. With twice the range instead, loops are sought all over a corridor, whose poses
 # slide by 1 m instead of 0.1 m.
@@ -49,7 +49,7 @@ def edge_from(i: int, j: int, result: RegistrationResult, *, uncertain: bool = F
     """The edge of a registration of cloud j to cloud i, with no information along unconstrained directions. None unless
     the status is CONVERGED or DEGENERATE, the overlap is at least 40 % and the covariance is known."""
     overlap = float(np.asarray(result.overlap))
-    if result.status not in (Status.CONVERGED, Status.DEGENERATE) or overlap < LEAST_OVERLAP:
+    if result.status not in (Status.CONVERGED, Status.DEGENERATE) or overlap < LEAST_OVERLAP_OF_LOOP:
         return None
     covariance, directions = np.asarray(result.covariance, np.float64), result.directions
     if directions is None or not np.isfinite(covariance).all():

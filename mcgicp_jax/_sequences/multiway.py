@@ -28,7 +28,7 @@ from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
 from mcgicp_jax._registration.options import GivenOptions, Options, check_method, options_of
 from mcgicp_jax._registration.register_pair import register_pair
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, is_usable
-from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP, edge_from, rows_before
+from mcgicp_jax._sequences.loop_closure import LEAST_OVERLAP_OF_LOOP, edge_from, rows_before
 
 # Size of the cells in which overlap is counted, in spacings of the points: two samples of one surface then occupy
 # nearly the same cells.
@@ -248,6 +248,6 @@ def _overlapping(clouds: list[PointCloud], poses: _Poses, cell: float) -> list[t
         overlaps = common[[j]].toarray()[0] / np.minimum(sizes, sizes[j])
         for rows in rows_before(j):
             best = max(rows, key=lambda row: overlaps[row])
-            if overlaps[best] >= LEAST_OVERLAP:
+            if overlaps[best] >= LEAST_OVERLAP_OF_LOOP:
                 pairs.append((best, j))
     return pairs

@@ -257,7 +257,8 @@ class CloudFiles(AbstractFrames):
         runs = re.compile(r"(\D*)(\d*)")
         paths = sorted(visible, key=lambda path: [(text, int(digits or 0)) for text, digits in runs.findall(path.name)])
         self.paths = [path for path in paths if is_cloud(path)]
-        self.left_out = [path for path in paths if path not in self.paths]
+        read = set(self.paths)
+        self.left_out = [path for path in paths if path not in read]
         if not self.paths:
             pattern = "" if glob == "*" else f" {glob}"
             raise ValueError(f"{folder}: expected clouds{pattern}, found none")
