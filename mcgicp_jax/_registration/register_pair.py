@@ -56,6 +56,7 @@ from mcgicp_jax._registration.start_check import (
     CLOSE,
     GOOD_FIT,
     LITTLE_IN_COMMON,
+    Doubt,
     SurfaceFit,
     distance_moved,
     doubt_of_start,
@@ -352,6 +353,10 @@ class _Candidate(NamedTuple):
     moved: float
     max_distance: str
 
+    @property
+    def status(self) -> Any:
+        return self.run.loop.state.status
+
 
 def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable[[float], Run]) -> tuple[Run, str]:
     """The registration, or `closely(max_distance)` from the same start if it may have left a right initial pose and
@@ -371,35 +376,54 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
             # All are measured within the same distance.
             fit, moved = surface_fit(run.inputs, executor, other_run.loop), distance_moved(start, other_run.loop.state)
             candidates.append(_Candidate(other_run, fit, moved, f"{distance:.2g}"))
-    for other in candidates:
+    best, rivals = _chosen(candidates, doubt, fine)
+    return best.run, _ambiguity(best, rivals, len(candidates), doubt, fine)
+
+
+def _chosen(candidates: list[_Candidate], doubt: Doubt, fine: float) -> tuple[_Candidate, list[_Candidate]]:
+    """The best of the candidates, and those whose poses may be right as well."""
+    best, *others = candidates
+    for other in others:
         best = other if other.fit.exceeds(best.fit, BETTER) else best
 
     def is_nearer(other: _Candidate) -> bool:
         """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone decides."""
         return doubt.by_shape and other.moved < best.moved - fine and bool(other.fit.fit > GOOD_FIT)
 
-    # Along what nothing constrains, the pose keeps its initial value.
-    if best.run.loop.state.status == Status.DEGENERATE:
+    def replaces(other: _Candidate) -> bool:
+        """Whether a pose has converged, and surfaces coincide about as well as at the best, which is changing."""
+        return bool(other.status == Status.CONVERGED and BETTER * other.fit.fit >= best.fit.fit)
+
+    changing = candidates[0] if doubt.changing else None
+    if best.status == Status.DEGENERATE:
+        # Along what nothing constrains, the pose keeps its initial value.
         best = next(filter(is_nearer, candidates), best)
+    elif best.status == Status.MAX_ITERATIONS:
+        changing, best = best, next(filter(replaces, candidates), best)
     margin = 1 / BETTER if doubt.few else 1.0
     rivals = [other for other in candidates if doubt.little or other.fit.exceeds(best.fit, margin) or is_nearer(other)]
+    return best, rivals if changing is None else [*rivals, changing]
+
+
+def _ambiguity(best: _Candidate, rivals: list[_Candidate], num_candidates: int, doubt: Doubt, fine: float) -> str:
+    """Why the pose of the best candidate is ambiguous, and what to pass; or nothing."""
     distances = [distance_moved(best.run.loop.state.pose, rival.run.loop.state) for rival in rivals]
     apart = max(distances, default=0.0)
     common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
-    reason = ""
-    if doubt.little and len(candidates) == 1:
-        reason = f"{common}registration with a smaller max_distance fails; pass a better initial pose"
-    elif apart > fine:
-        rival = rivals[distances.index(apart)]
-        nearest = min(best, rival, key=lambda candidate: candidate.moved)
-        coincide = "" if doubt.little else ", at which surfaces coincide about as well"
-        reason = (
-            f"{common}max_distance={best.max_distance} leads from the initial pose to this one, "
-            f"{best.moved:.2g} m away, and max_distance={rival.max_distance} to another, {apart:.2g} m from this one"
-            f"{coincide}; pass max_distance={nearest.max_distance} if the initial pose is good to {fine:.2g} m, or a "
-            "better init"
-        )
-    return best.run, reason
+    if doubt.little and num_candidates == 1:
+        return f"{common}registration with a smaller max_distance fails; pass a better initial pose"
+    if apart <= fine:
+        return ""
+    rival = rivals[distances.index(apart)]
+    nearest = min(best, rival, key=lambda candidate: candidate.moved)
+    changing = rival.status == Status.MAX_ITERATIONS
+    coincide = "" if changing or doubt.little else ", at which surfaces coincide about as well"
+    return (
+        f"{common}max_distance={best.max_distance} leads from the initial pose to this one, {best.moved:.2g} m away, "
+        f"and max_distance={rival.max_distance} to another{' that is still changing' if changing else ''}, {apart:.2g} "
+        f"m from this one{coincide}; pass max_distance={nearest.max_distance} if the initial pose is good to "
+        f"{fine:.2g} m, or a better init"
+    )
 
 
 def _equalized(inputs: Inputs, matches: Correspondences | None = None) -> Inputs:

@@ -41,9 +41,10 @@ class Status(enum.IntEnum):
         UNVERIFIED: the pose is registered, but it may be wrong (outside of transformations a warning says why): less
             than 10 % of the source points have a match; less than 60 % lie on the target, and with a smaller
             `max_distance` the same start leads to another pose; the surfaces hardly coincide, and at that other pose
-            they do so a little better; with `init="global"`, `global_pose` had no success; the pose contradicts the
-            `prior`, by more standard deviations than in one of a million right cases; or channels alone hold it along
-            some direction, and are so simple a function of position that they may move with the sensor.
+            they do so a little better; with the coarse `max_distance` the pose does not come to rest; with
+            `init="global"`, `global_pose` had no success; the pose contradicts the `prior`, by more standard deviations
+            than in one of a million right cases; or channels alone hold it along some direction, and are so simple a
+            function of position that they may move with the sensor.
     """
 
     CONVERGED = 0

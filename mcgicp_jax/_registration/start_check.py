@@ -92,6 +92,7 @@ class Doubt(NamedTuple):
         little: whether the views have little in common.
         few: whether there are few matches.
         by_shape: whether there are few matches, and no channel constrains the pose.
+        changing: whether the one reason is that its pose is still changing.
     """
 
     fit: SurfaceFit
@@ -99,6 +100,7 @@ class Doubt(NamedTuple):
     little: bool
     few: bool
     by_shape: bool
+    changing: bool
 
 
 def doubt_of_start(
@@ -111,8 +113,9 @@ def doubt_of_start(
     """The doubt of a registration, if there is any; `measure_fit` computes the `surface_fit` at its pose.
 
     It may have left a right initial pose if it has moved the points by more than the fine `max_distance`, and surfaces
-    do not coincide at its pose, or have little in common; and if shape alone decides, also if it has moved them far, or
-    is DEGENERATE. (At several scales the initial pose is known to be far off, where the fine distance leads nowhere.)
+    do not coincide at its pose, or have little in common, or the pose is still changing; and if shape alone decides,
+    also if it has moved them far, or is DEGENERATE. (At several scales the initial pose is known to be far off, where
+    the fine distance leads nowhere.)
     """
     if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
         return None
@@ -124,8 +127,9 @@ def doubt_of_start(
     little = bool(fit.overlap < LITTLE_IN_COMMON) and not at_scales
     by_shape = few and not np.any(cast(Directions, state.directions).constrained_by_channels)
     far = moved > FAR * settings.max_distance or state.status == Status.DEGENERATE
-    doubtful = fit.fit < (GOOD_FIT if few else LEAST_FIT) or little or (by_shape and far and not at_scales)
-    return Doubt(fit, moved, little, few, by_shape) if doubtful else None
+    left = fit.fit < (GOOD_FIT if few else LEAST_FIT) or little or (by_shape and far and not at_scales)
+    changing = not (left or at_scales) and state.status == Status.MAX_ITERATIONS
+    return Doubt(fit, moved, little, few, by_shape, changing) if left or changing else None
 
 
 def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> SurfaceFit:
