@@ -254,7 +254,6 @@ def test_a_planar_scan_from_far_off(data, known, variance):
         result = mcg.register(*clouds, mcg.PointToPoint(), init=start, prior=prior, max_distance=(5, 0.2))
         # Walls hardly tell the height.
         assert near(result, truth, 0.05 if "z" in known else 0.1)
-        for method in (mcg.PointToPoint(), mcg.GICP()):
-            # The default distances find fewer poses, and others are not CONVERGED.
-            by_default = mcg.register(*clouds, method, init=start, prior=prior)
-            assert by_default.status is not mcg.Status.CONVERGED or near(by_default, truth, 0.1)
+        # The default distances find fewer poses, and others are not CONVERGED.
+        by_default = mcg.register(*clouds, mcg.PointToPoint(), init=start, prior=prior)
+        assert by_default.status is not mcg.Status.CONVERGED or near(by_default, truth, 0.1)

@@ -219,9 +219,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
         run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
         if doubt and distance_moved(problem.start, run.loop.state) > settings.fine_distance:
-            # The doubt was about another pose. It holds for this one, too, if the views have little in common at it.
-            fit = surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop)
-            doubt = doubt if fit.overlap < LITTLE_IN_COMMON else ""
+            # The doubt was about another pose.
+            doubt = ""
     if traced:
         return run
     status = run.loop.state.status
