@@ -46,14 +46,14 @@ BETTER = 1.3
 # With few matches, a third registration with this fraction of the fine `max_distance`, 1.5 spacings, is compared as
 # well: where spacings are nearly as large as furniture, the fine distance leads from a right pose to a wrong one, too.
 # Of 576 registrations of such rooms, 22 were CONVERGED and off by more than six deviations with a second one alone, and
-# now two.
+# now none.
 CLOSE = 0.6
 # With few matches and no channel that constrains the pose, a DEGENERATE pose, or one that is further from the initial
 # pose than this fraction of the coarse `max_distance`, is compared however well its surfaces coincide: in a corridor
 # they coincide at many poses, and more points have matches where one cloud lies over the other. Of 288 registrations of
 # 300 to 3,000 points of corridors and rooms, half to three quarters in common, from starts within 0.3 m, 50 were
-# CONVERGED and off by more than six deviations, and now 14; 37 were DEGENERATE and had slid by more than 0.5 m, and now
-# 11.
+# CONVERGED and off by more than six deviations, and now 11; 37 were DEGENERATE and had slid by more than 0.5 m, and now
+# four.
 FAR = 0.5
 # Fraction of the source points that lie on the target, in position, below which views have little in common. A pose at
 # which more points lie on surfaces may then win, though these coincide: of 160 views of rooms from 46 to 63° apart, six
