@@ -54,7 +54,6 @@ from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
     BETTER,
     CLOSE,
-    GOOD_FIT,
     LITTLE_IN_COMMON,
     Doubt,
     SurfaceFit,
@@ -386,10 +385,8 @@ def _chosen(candidates: list[_Candidate], doubt: Doubt, fine: float) -> tuple[_C
         best = other if other.fit.exceeds(best.fit, BETTER) else best
 
     def is_nearer(other: _Candidate) -> bool:
-        """Whether surfaces coincide, or do about as well, at a pose nearer to the initial one than the best, and shape
-        alone decides. With more matches they have to: scan lines match themselves at the initial pose."""
-        least = GOOD_FIT if other.fit.overlap > best.fit.overlap else min(GOOD_FIT, best.fit.fit / BETTER)
-        return doubt.by_shape and other.moved < best.moved - fine and bool(other.fit.fit > least)
+        """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone decides."""
+        return doubt.by_shape and other.moved < best.moved - fine and other.fit.coincides_like(best.fit)
 
     def replaces(other: _Candidate) -> bool:
         """Whether a pose has converged, and surfaces coincide about as well as at the best, which is changing."""

@@ -82,6 +82,12 @@ class SurfaceFit(NamedTuple):
         least = _SOME_FIT if self.overlap <= other.overlap else GOOD_FIT
         return bool(self.fit > least and self.fit * self.overlap > factor * other.fit * other.overlap)
 
+    def coincides_like(self, other: SurfaceFit) -> bool:
+        """Whether surfaces coincide, or do about as well as at another pose. With more matches than there they have to,
+        since scan lines match themselves at the initial pose."""
+        least = GOOD_FIT if self.overlap > other.overlap else max(_SOME_FIT, min(GOOD_FIT, other.fit / BETTER))
+        return bool(self.fit > least)
+
 
 class Doubt(NamedTuple):
     """Why a registration may have left a right initial pose.
