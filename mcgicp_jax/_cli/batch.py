@@ -75,7 +75,7 @@ def batch(
         pairs: CSV file or folder.
         output: Table to write or to resume, .csv. A row per pair, at the end in the order of PAIRS: source,
             target, initial pose if given, status, iterations, inliers, overlap, cost, rmse, the upper three rows of the
-            pose, its deviations (m, rad), and why it is not converged: the reason, or what to try.
+            pose, its deviations (m, rad), and why it has not converged, or what to try.
         method: {channel_methods} use channels (intensity, colours, ...), the others geometry alone.
         glob: Pattern for the files of a folder, such as "*.ply".
         workers: Number of processes. auto: threads, or one process per core where that is faster.
@@ -273,7 +273,7 @@ def _write_rows(path: Path, rows: Iterable[Row]) -> None:
 def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     quality = result.num_iterations, result.num_inliers, result.overlap, result.cost, result.rmse
     values = (np.asarray(number).item() for number in (*quality, *result.matrix[:3].ravel(), *result.deviations))
-    if result.status is mcg.Status.DEGENERATE:
+    if not reason and result.status is mcg.Status.DEGENERATE:
         reason = f"unconstrained: {as_text(result.unconstrained_directions)}"
     reason = " ".join((reason or result.status.advice).split())
     texts = (*key, result.status.name.lower(), *map(repr, values), reason)

@@ -61,10 +61,10 @@ def register(
     the points by more than the fine distance to a pose at which the surfaces do not coincide, a second registration
     from `init` uses the fine distance alone, and is the result if they coincide better. With fewer than 4,000 matches,
     and no channel that constrains the pose, there is also a second registration if the first one is DEGENERATE, or has
-    moved the points by more than half of the coarse distance. If the surfaces coincide at a pose nearer to `init`, too,
-    this pose replaces a DEGENERATE one, and any other pose is UNVERIFIED. A pose that is still changing is replaced by
-    that of the fine distance, UNVERIFIED, if that one has converged and the surfaces coincide about as well there. None
-    of this is done inside transformations: pass a small `max_distance` there if `init` is near.
+    moved the points by more than half of the coarse distance. If the surfaces coincide about as well at a pose nearer
+    to `init`, this pose replaces a DEGENERATE one, and any other pose is UNVERIFIED. If the first registration does not
+    converge, and at the pose of the second, which does, the surfaces coincide about as well, that pose is the result,
+    UNVERIFIED. None of this is done inside transformations: pass a small `max_distance` there if `init` is near.
 
     Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
     shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches

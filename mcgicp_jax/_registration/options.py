@@ -87,8 +87,12 @@ class Options:
     @property
     def numbers(self) -> dict[str, Any]:
         """The options that may be arrays, constants to autodiff."""
-        names = ("max_distance", "translation_tolerance", "rotation_tolerance", "hold_unconstrained")
-        return {name: getattr(self, name) for name in names}
+        return {
+            "max_distance": self.max_distance,
+            "translation_tolerance": self.translation_tolerance,
+            "rotation_tolerance": self.rotation_tolerance,
+            "hold_unconstrained": self.hold_unconstrained,
+        }
 
     @property
     def has_two_distances(self) -> bool:

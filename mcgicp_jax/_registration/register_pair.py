@@ -52,11 +52,8 @@ from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jac
 from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status
 from mcgicp_jax._registration.settings import settings_for, spacing_of
 from mcgicp_jax._registration.start_check import (
-    BETTER,
-    CLOSE,
-    LITTLE_IN_COMMON,
-    Doubt,
-    SurfaceFit,
+    Candidate,
+    choice_of,
     distance_moved,
     doubt_of_start,
     surface_fit,
@@ -218,7 +215,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
         run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
         if doubt and distance_moved(problem.start, run.loop.state) > settings.fine_distance:
-            # The doubt was about another pose.
+            # It was about another pose.
             doubt = ""
     if traced:
         return run
@@ -342,86 +339,26 @@ def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | 
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
 
-class _Candidate(NamedTuple):
-    """A registration from the initial pose, how its surfaces coincide, how far it has moved the points (metres), and
-    the `max_distance` that it used, for messages."""
-
-    run: Run
-    fit: SurfaceFit
-    moved: float
-    max_distance: str
-
-    @property
-    def status(self) -> Any:
-        return self.run.loop.state.status
-
-
 def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable[[float], Run]) -> tuple[Run, str]:
     """The registration, or `closely(max_distance)` from the same start if it may have left a right initial pose and
     surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing."""
     settings, state, executor = run.problem.settings, run.loop.state, cast(HostExecutor, run.executor)
     source, target = run.inputs[:2]
-    start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
+    start = run.problem.start
+    if at_scales:
+        start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
     doubt = doubt_of_start(start, state, settings, partial(surface_fit, run.inputs, executor, run.loop), at_scales)
     if doubt is None:
         return run, ""
     fine = float(settings.fine_distance)
-    best = _Candidate(run, doubt.fit, doubt.moved, f"({float(settings.max_distance):.2g}, {fine:.2g})")
-    candidates = [best]
-    for distance in (fine, CLOSE * fine) if doubt.few and not doubt.little else (fine,):
-        other_run = closely(distance)
-        if other_run.loop.state.status in USABLE:
+    candidates = [Candidate(run, state, doubt.fit, doubt.moved, f"({float(settings.max_distance):.2g}, {fine:.2g})")]
+    for distance in doubt.distances(fine):
+        other = closely(distance)
+        if other.loop.state.status in USABLE:
             # All are measured within the same distance.
-            fit, moved = surface_fit(run.inputs, executor, other_run.loop), distance_moved(start, other_run.loop.state)
-            candidates.append(_Candidate(other_run, fit, moved, f"{distance:.2g}"))
-    best, rivals = _chosen(candidates, doubt, fine)
-    return best.run, _ambiguity(best, rivals, len(candidates), doubt, fine)
-
-
-def _chosen(candidates: list[_Candidate], doubt: Doubt, fine: float) -> tuple[_Candidate, list[_Candidate]]:
-    """The best of the candidates, and those whose poses may be right as well."""
-    best, *others = candidates
-    for other in others:
-        best = other if other.fit.exceeds(best.fit, BETTER) else best
-
-    def is_nearer(other: _Candidate) -> bool:
-        """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone decides."""
-        return doubt.by_shape and other.moved < best.moved - fine and other.fit.coincides_like(best.fit)
-
-    def replaces(other: _Candidate) -> bool:
-        """Whether a pose has converged, and surfaces coincide about as well as at the best, which is changing."""
-        return bool(other.status == Status.CONVERGED and BETTER * other.fit.fit >= best.fit.fit)
-
-    changing = candidates[0] if doubt.changing else None
-    if best.status == Status.DEGENERATE:
-        # Along what nothing constrains, the pose keeps its initial value.
-        best = next(filter(is_nearer, candidates), best)
-    elif best.status == Status.MAX_ITERATIONS:
-        changing, best = best, next(filter(replaces, candidates), best)
-    margin = 1 / BETTER if doubt.few else 1.0
-    rivals = [other for other in candidates if doubt.little or other.fit.exceeds(best.fit, margin) or is_nearer(other)]
-    return best, rivals if changing is None else [*rivals, changing]
-
-
-def _ambiguity(best: _Candidate, rivals: list[_Candidate], num_candidates: int, doubt: Doubt, fine: float) -> str:
-    """Why the pose of the best candidate is ambiguous, and what to pass; or nothing."""
-    distances = [distance_moved(best.run.loop.state.pose, rival.run.loop.state) for rival in rivals]
-    apart = max(distances, default=0.0)
-    common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
-    if doubt.little and num_candidates == 1:
-        return f"{common}registration with a smaller max_distance fails; pass a better initial pose"
-    if apart <= fine:
-        return ""
-    rival = rivals[distances.index(apart)]
-    nearest = min(best, rival, key=lambda candidate: candidate.moved)
-    changing = rival.status == Status.MAX_ITERATIONS
-    coincide = "" if changing or doubt.little else ", at which surfaces coincide about as well"
-    return (
-        f"{common}max_distance={best.max_distance} leads from the initial pose to this one, {best.moved:.2g} m away, "
-        f"and max_distance={rival.max_distance} to another{' that is still changing' if changing else ''}, {apart:.2g} "
-        f"m from this one{coincide}; pass max_distance={nearest.max_distance} if the initial pose is good to "
-        f"{fine:.2g} m, or a better init"
-    )
+            fit, moved = surface_fit(run.inputs, executor, other.loop), distance_moved(start, other.loop.state)
+            candidates.append(Candidate(other, other.loop.state, fit, moved, f"{distance:.2g}"))
+    return choice_of(candidates, doubt, fine)
 
 
 def _equalized(inputs: Inputs, matches: Correspondences | None = None) -> Inputs:

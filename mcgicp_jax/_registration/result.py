@@ -40,11 +40,11 @@ class Status(enum.IntEnum):
         WORKER_FAILED: two workers in turn failed with this pair. Only in batches; the pose is NaN.
         UNVERIFIED: the pose is registered, but it may be wrong (outside of transformations a warning says why): less
             than 10 % of the source points have a match; less than 60 % lie on the target, and with a smaller
-            `max_distance` the same start leads to another pose; the surfaces hardly coincide, and at that other pose
-            they do so a little better; with the coarse `max_distance` the pose does not come to rest; with
-            `init="global"`, `global_pose` had no success; the pose contradicts the `prior`, by more standard deviations
-            than in one of a million right cases; or channels alone hold it along some direction, and are so simple a
-            function of position that they may move with the sensor.
+            `max_distance` the same start leads to another pose; the surfaces coincide about as well at that other pose;
+            with the coarse `max_distance` the registration does not converge; with `init="global"`, `global_pose` had
+            no success; the pose contradicts the `prior`, by more standard deviations than in one of a million right
+            cases; or channels alone hold it along some direction, and are so simple a function of position that they
+            may move with the sensor.
     """
 
     CONVERGED = 0
@@ -69,7 +69,7 @@ class Status(enum.IntEnum):
 _ADVICE = {
     Status.CONVERGED: "",
     Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
-    "try init with a better initial pose, other max_distance, or a larger max_iterations",
+    "try init with a better initial pose, another max_distance, or a larger max_iterations",
     Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
     "are both clouds in metres? If so, try init with a pose at which they overlap, or a larger max_distance",
     Status.DEGENERATE: "the pose is unconstrained in at least one direction; try clouds that show more of the scene, "

@@ -9,7 +9,7 @@ common, the surfaces may coincide there, too, and neither pose can be promised.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import jaxlie
 import numpy as np
@@ -30,38 +30,41 @@ from mcgicp_jax._registration.settings import Settings
 # 0.073 at 53 wrong poses of rooms that were cut, KITTI, another LiDAR and simulated streets. At right poses it was 0.17
 # or more in these rooms, 0.27 in furnished ones and in streets, 0.25 on KITTI; but less in 18 of 128 registrations of
 # raw scans, where another one, which is not better, costs its time alone.
-LEAST_FIT, _MANY = 0.08, 4000
+_LEAST_FIT, _MANY = 0.08, 4000
 # The same for fewer matches, whose thick neighbourhoods fit wrong poses better: up to 0.29 in rooms of 330 to 2,000
 # points. A pose with more matches than the one that it replaces must fit so well, too. Scan lines match themselves at
 # the initial pose, where more points have matches, the fit was up to 0.16, and the evidence up to 3.2 times as large as
 # at the right pose (a LiDAR with an eighth of its beams); cut rooms have fewer matches at the right pose.
-GOOD_FIT = 0.3
+_GOOD_FIT = 0.3
 # A pose with less is no better than any other. It was at most 0.022 at wrong poses of a planar scan, whose surfaces
 # coincide nowhere (0.001 at the right one), and at least 0.044 at right poses of the sparsest rooms.
 _SOME_FIT = 0.03
 # Another pose is better if its evidence, overlap times fit, is at least so many times as large. It was 1.65 to 226
 # times as large at right poses that replace wrong ones, and at most 1.04 times at wrong poses: on a plane, where any
 # pose fits. In between neither is promised; and with few matches neither if the other pose is not this much worse.
-BETTER = 1.3
+_BETTER = 1.3
 # With few matches, a third registration with this fraction of the fine `max_distance`, 1.5 spacings, is compared as
 # well: where spacings are nearly as large as furniture, the fine distance leads from a right pose to a wrong one, too.
 # Of 576 registrations of such rooms, 22 were CONVERGED and off by more than six deviations with a second one alone, and
 # now none.
-CLOSE = 0.6
+_CLOSE = 0.6
 # With few matches and no channel that constrains the pose, a DEGENERATE pose, or one that is further from the initial
 # pose than this fraction of the coarse `max_distance`, is compared however well its surfaces coincide: in a corridor
 # they coincide at many poses, and more points have matches where one cloud lies over the other. Of 288 registrations of
 # 300 to 3,000 points of corridors and rooms, half to three quarters in common, from starts within 0.3 m, 50 were
 # CONVERGED and off by more than six deviations, and now 11; 37 were DEGENERATE and had slid by more than 0.5 m, and now
 # four.
-FAR = 0.5
+_FAR = 0.5
 # Fraction of the source points that lie on the target, in position, below which views have little in common. A pose at
 # which more points lie on surfaces may then win, though these coincide: of 160 views of rooms from 46 to 63° apart, six
 # were CONVERGED up to 1.3 m off, at 0.25 to 0.44. (Now none, and of 73 right ones, five are UNVERIFIED. Right poses of
 # KITTI and tables had at least 0.75, of 7-Scenes and of another LiDAR 0.42; the smaller distance led to them, too.)
-LITTLE_IN_COMMON = 0.6
+_LITTLE_IN_COMMON = 0.6
 # Number of matches that are compared. Four times as many do not separate poses any better.
 _SAMPLE = 1024
+
+
+AnyRun = TypeVar("AnyRun")
 
 
 class SurfaceFit(NamedTuple):
@@ -79,13 +82,13 @@ class SurfaceFit(NamedTuple):
     def exceeds(self, other: SurfaceFit, factor: float) -> bool:
         """Whether the evidence for this pose, overlap times fit, is more than `factor` times that for another one. Of
         more matches, which may lie beyond a cut, it is not, unless they fit well."""
-        least = _SOME_FIT if self.overlap <= other.overlap else GOOD_FIT
+        least = _SOME_FIT if self.overlap <= other.overlap else _GOOD_FIT
         return bool(self.fit > least and self.fit * self.overlap > factor * other.fit * other.overlap)
 
     def coincides_like(self, other: SurfaceFit) -> bool:
         """Whether surfaces coincide, or do about as well as at another pose. With more matches than there they have to,
         since scan lines match themselves at the initial pose."""
-        least = GOOD_FIT if self.overlap > other.overlap else max(_SOME_FIT, min(GOOD_FIT, other.fit / BETTER))
+        least = _GOOD_FIT if self.overlap > other.overlap else max(_SOME_FIT, min(_GOOD_FIT, other.fit / _BETTER))
         return bool(self.fit > least)
 
 
@@ -107,6 +110,28 @@ class Doubt(NamedTuple):
     few: bool
     by_shape: bool
     changing: bool
+
+    def distances(self, fine: float) -> list[float]:
+        """The `max_distance` of the registrations that are compared, metres."""
+        return [fine, _CLOSE * fine] if self.few and not self.little else [fine]
+
+
+class Candidate(NamedTuple, Generic[AnyRun]):
+    """A registration from the initial pose.
+
+    Attributes:
+        run: the registration.
+        state: at its end.
+        fit: at its pose.
+        moved: how far it has moved the points, metres.
+        max_distance: that it used, for messages.
+    """
+
+    run: AnyRun
+    state: State
+    fit: SurfaceFit
+    moved: float
+    max_distance: str
 
 
 def doubt_of_start(
@@ -130,10 +155,10 @@ def doubt_of_start(
         return None
     fit = measure_fit()
     few = bool(state.record.num_inliers < _MANY)
-    little = bool(fit.overlap < LITTLE_IN_COMMON) and not at_scales
+    little = bool(fit.overlap < _LITTLE_IN_COMMON) and not at_scales
     by_shape = few and not np.any(cast(Directions, state.directions).constrained_by_channels)
-    far = moved > FAR * settings.max_distance or state.status == Status.DEGENERATE
-    left = fit.fit < (GOOD_FIT if few else LEAST_FIT) or little or (by_shape and far and not at_scales)
+    far = moved > _FAR * settings.max_distance or state.status == Status.DEGENERATE
+    left = fit.fit < (_GOOD_FIT if few else _LEAST_FIT) or little or (by_shape and far and not at_scales)
     changing = not (left or at_scales) and state.status == Status.MAX_ITERATIONS
     return Doubt(fit, moved, little, few, by_shape, changing) if left or changing else None
 
@@ -172,3 +197,54 @@ def distance_moved(start: jaxlie.SE3, state: State) -> float:
     shift = arm - turn.T @ arm + after.translation - before.translation
     angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
     return float(np.linalg.norm(shift) + directions.radius * angle)
+
+
+def choice_of(candidates: list[Candidate[AnyRun]], doubt: Doubt, fine: float) -> tuple[AnyRun, str]:
+    """The best registration, and why its pose is ambiguous, or nothing. The first candidate is the one in doubt, with
+    the fine `max_distance` `fine`, metres."""
+    best, *others = candidates
+    for other in others:
+        best = other if other.fit.exceeds(best.fit, _BETTER) else best
+
+    def is_nearer(other: Candidate[AnyRun]) -> bool:
+        """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone decides."""
+        return doubt.by_shape and other.moved < best.moved - fine and other.fit.coincides_like(best.fit)
+
+    def replaces(other: Candidate[AnyRun]) -> bool:
+        """Whether a pose has converged, and surfaces coincide about as well as at the best, which is changing."""
+        return bool(other.state.status == Status.CONVERGED and _BETTER * other.fit.fit >= best.fit.fit)
+
+    changing = candidates[0] if doubt.changing else None
+    if best.state.status == Status.DEGENERATE:
+        # Along what nothing constrains, the pose keeps its initial value.
+        best = next(filter(is_nearer, candidates), best)
+    elif best.state.status == Status.MAX_ITERATIONS:
+        changing, best = best, next(filter(replaces, candidates), best)
+    margin = 1 / _BETTER if doubt.few else 1.0
+    rivals = [
+        other
+        for other in candidates
+        if doubt.little or other is changing or other.fit.exceeds(best.fit, margin) or is_nearer(other)
+    ]
+    return best.run, _ambiguity(best, rivals, doubt.little, fine)
+
+
+def _ambiguity(best: Candidate[Any], rivals: list[Candidate[Any]], little: bool, fine: float) -> str:
+    """Why the pose of the best candidate is ambiguous, and what to pass; or nothing."""
+    distances = [distance_moved(best.state.pose, rival.state) for rival in rivals]
+    apart = max(distances, default=0.0)
+    common = f"fewer than {_LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if little else ""
+    if little and len(rivals) == 1:
+        return f"{common}registration with a smaller max_distance fails; pass a better initial pose"
+    if apart <= fine:
+        return ""
+    rival = rivals[distances.index(apart)]
+    nearest = min(best, rival, key=lambda candidate: candidate.moved)
+    changing = rival.state.status == Status.MAX_ITERATIONS
+    coincide = "" if changing or little else ", at which surfaces coincide about as well"
+    return (
+        f"{common}max_distance={best.max_distance} leads from the initial pose to this one, {best.moved:.2g} m away, "
+        f"and max_distance={rival.max_distance} to another{' that is still changing' if changing else ''}, {apart:.2g} "
+        f"m from this one{coincide}; pass max_distance={nearest.max_distance} if the initial pose is good to "
+        f"{fine:.2g} m, or a better init"
+    )
