@@ -9,6 +9,7 @@ common, the surfaces may coincide there, too, and neither pose can be promised.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar, cast
 
 import jaxlie
@@ -116,7 +117,8 @@ class Doubt(NamedTuple):
         return [fine, _CLOSE * fine] if self.few and not self.little else [fine]
 
 
-class Candidate(NamedTuple, Generic[AnyRun]):
+@dataclass(frozen=True, eq=False)
+class Candidate(Generic[AnyRun]):
     """A registration from the initial pose.
 
     Attributes:
