@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from mcgicp_jax._clouds.placeholders import measured_rows
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
@@ -39,6 +39,7 @@ def deskew(cloud: PointCloud, motion: Pose) -> PointCloud:
     Raises:
         ValueError: if the cloud has no times, or a concrete pose is no rigid motion.
     """
+    cloud = as_cloud("cloud", cloud)
     if cloud.times is None:
         raise ValueError(
             "cloud: expected times of its points, PointCloud(points, times=...), got none; preprocess keeps none"
@@ -49,7 +50,9 @@ def deskew(cloud: PointCloud, motion: Pose) -> PointCloud:
     (shifts,) = blockwise(_shift, twist, Input(points), Input(cloud.times.astype(dtype)[:, None]))
     values, xp = primal(cloud), numpy_for(cloud.points, shifts)
     if is_concrete(values):
-        shifts = xp.where(_measured_rows(values)[:, None], shifts, 0)
+        # `measured_rows` counts the first of many zeros as a measurement.
+        moving = _measured_rows(values) & np.any(values.points, axis=1)
+        shifts = xp.where(moving[:, None], shifts, 0)
     return cloud.replace_rows(points=xp.asarray(cloud.points) + shifts, times=None)
 
 

@@ -351,13 +351,13 @@ def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable
     if doubt is None:
         return run, ""
     fine = float(settings.fine_distance)
-    candidates = [Candidate(run, state, doubt.fit, doubt.moved, f"({float(settings.max_distance):.2g}, {fine:.2g})")]
+    candidates = [Candidate(run, state, doubt.fit, doubt.moved, (float(settings.max_distance), fine))]
     for distance in doubt.distances(fine):
         other = closely(distance)
         if other.loop.state.status in USABLE:
             # All are measured within the same distance.
             fit, moved = surface_fit(run.inputs, executor, other.loop), distance_moved(start, other.loop.state)
-            candidates.append(Candidate(other, other.loop.state, fit, moved, f"{distance:.2g}"))
+            candidates.append(Candidate(other, other.loop.state, fit, moved, (distance,)))
     return choice_of(candidates, doubt, fine)
 
 

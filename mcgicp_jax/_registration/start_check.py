@@ -126,14 +126,20 @@ class Candidate(Generic[AnyRun]):
         state: at its end.
         fit: at its pose.
         moved: how far it has moved the points, metres.
-        max_distance: that it used, for messages.
+        max_distance: that it used, metres: the coarse and the fine one, or one for both.
     """
 
     run: AnyRun
     state: State
     fit: SurfaceFit
     moved: float
-    max_distance: str
+    max_distance: tuple[float, ...]
+
+    @property
+    def limit(self) -> str:
+        """The `max_distance` as an argument."""
+        numbers = ", ".join(f"{distance:.2g}" for distance in self.max_distance)
+        return f"({numbers})" if len(self.max_distance) > 1 else numbers
 
 
 def doubt_of_start(
@@ -243,10 +249,12 @@ def _ambiguity(best: Candidate[Any], rivals: list[Candidate[Any]], little: bool,
     rival = rivals[distances.index(apart)]
     nearest = min(best, rival, key=lambda candidate: candidate.moved)
     changing = rival.state.status == Status.MAX_ITERATIONS
+    another = "another that is still changing" if changing else "another"
     coincide = "" if changing or little else ", at which surfaces coincide about as well"
+    # Two distances would lead to the same doubt.
+    advice = f"max_distance={nearest.limit} if the initial pose is good to {fine:.2g} m, or "
     return (
-        f"{common}max_distance={best.max_distance} leads from the initial pose to this one, {best.moved:.2g} m away, "
-        f"and max_distance={rival.max_distance} to another{' that is still changing' if changing else ''}, {apart:.2g} "
-        f"m from this one{coincide}; pass max_distance={nearest.max_distance} if the initial pose is good to "
-        f"{fine:.2g} m, or a better init"
+        f"{common}max_distance={best.limit} leads from the initial pose to this one, {best.moved:.2g} m away, and "
+        f"max_distance={rival.limit} to {another}, {apart:.2g} m from this one{coincide}; pass "
+        f"{advice if len(nearest.max_distance) == 1 else ''}a better init"
     )
