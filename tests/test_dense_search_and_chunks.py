@@ -20,7 +20,7 @@ from mcgicp_jax._registration import chunks, register_pair
 from mcgicp_jax.extend import SearchPoints
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
-from tests.batches import METHOD, assert_same, prepared
+from tests.batches import METHOD, assert_same
 from tests.compilations import compilations
 from tests.precision import in_both_precisions
 from tests.promise_scenes import office, views
@@ -120,7 +120,8 @@ def test_no_table_of_pairs_is_stored(num_candidates, lanes):
 
 @pytest.fixture(scope="module")
 def clouds(raw):
-    return prepared(raw)
+    """With fewer neighbours than raw clouds get, which shows where given ones are lost."""
+    return [[mcg.preprocess(pair[side], None, num_neighbors=15) for pair in raw] for side in (0, 1)]
 
 
 def test_matches_are_those_of_the_tree(clouds):
@@ -184,19 +185,32 @@ def test_a_batch_in_chunks_is_its_pairs(raw, clouds):
         assert max(pose_error(again.matrix, results[i].matrix)) < 1e-6
 
 
-def test_raw_clouds_in_chunks_are_prepared_as_one_by_one(raw):
-    """Neighbours, surfaces and parameters are computed on the device. A pair without enough points does no harm."""
-    sides = [[raw[i][side] for i in (0, 1, 3, 5)] for side in (0, 1)]
-    sides[0][1] = np.zeros((3, 3))
-    spoilt = sides[1][2]
-    sides[1][2] = spoilt.replace(points=np.where(np.arange(310)[:, None] % 10, spoilt.points, np.nan))
+def test_raw_clouds_in_chunks_are_prepared_as_one_by_one(raw, monkeypatch):
+    """Neighbours, surfaces and parameters are computed on the device, by one program for pairs that fill at least half
+    of the size of the first. A pair without enough points does no harm."""
+    shapes, program = [], chunks._registered
+
+    def noted(chunk, *arguments, **named):
+        shapes.append((chunk.source.valid.shape[1], chunk.target.valid.shape[1]))
+        return program(chunk, *arguments, **named)
+
+    monkeypatch.setattr(chunks, "_registered", noted)
+    sources, targets = (
+        [raw[2][side].replace_rows(valid=np.arange(len(raw[2][side])) < size).unpad() for size in (490, 400, 260, 310)]
+        for side in (0, 1)
+    )
+    sources[1] = np.zeros((3, 3))
+    targets[2] = targets[2].replace(points=np.where(np.arange(260)[:, None] % 10, targets[2].points, np.nan))
     with pytest.warns(mcg.PairWarning, match="pair 1"), ThreadPoolExecutor(1) as executor:
-        found, expected = in_chunks(*sides), in_chunks(*sides, executor=executor)
-    assert [result.status for result in found] == [result.status for result in expected]
-    assert [result.converged for result in found] == [True, False, True, True]
+        results = in_chunks(sources, targets, covariances=False)
+        expected = in_chunks(sources, targets, executor=executor)
+    assert set(shapes) == {(512, 512)}
+    assert [result.status for result in results] == [result.status for result in expected]
+    assert [result.converged for result in results] == [True, False, True, True]
     for i in (0, 2, 3):
-        assert max(pose_error(found[i].matrix, expected[i].matrix)) < 1e-5
-        assert found[i].overlap == expected[i].overlap
+        assert max(pose_error(results[i].matrix, expected[i].matrix)) < 1e-5
+        assert results[i].overlap == expected[i].overlap
+        assert np.isnan(results[i].covariance).all() and np.isfinite(expected[i].covariance).all()
 
 
 def test_pairs_that_may_have_left_a_right_pose_are_registered_again(monkeypatch):
@@ -276,7 +290,7 @@ def test_given_neighbours_stay_where_a_channel_is_left_out(raw, on_host, monkeyp
         points, channels = (np.asarray(array) for array in (raw[0][side].points, raw[0][side].channels))
         points = points - np.array([0.7, 0.8, 0.9])
         channels = np.column_stack([np.linalg.norm(points, axis=1), channels[:, 0]])
-        sides.append([mcg.preprocess(mcg.PointCloud(points, channels), None, num_neighbors=6)])
+        sides.append([mcg.preprocess(mcg.PointCloud(points, channels), None, num_neighbors=15)])
     (found,), (expected,) = in_chunks(*sides), in_chunks(*sides, executor="threads")
     assert found.status is expected.status and found.overlap == expected.overlap
     assert max(pose_error(found.matrix, expected.matrix)) < 1e-5
@@ -293,7 +307,7 @@ def test_units_are_warned_of_in_chunks_too(raw):
 def test_a_stream_yields_invalid_pairs_and_those_of_many_updates_on_the_way(clouds, monkeypatch):
     sources, targets = ([side[1]] * 63 for side in clouds)
     sources[2] = np.zeros((3, 3))
-    starts = [motion((0.1, -0.1, 0.05, 0.02, 0, 0.05)), *[None] * 62]
+    starts = [motion((0.2, -0.2, 0.1, 0.05, 0, 0.1)), *[None] * 62]
     slow, usual = in_chunks(sources[:2], targets[:2], init=starts[:2])
     assert slow.num_iterations > usual.num_iterations
     monkeypatch.setattr(chunks, "_FIRST_UPDATES", int(slow.num_iterations))
@@ -344,27 +358,6 @@ def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     with compilations() as found:
         assert ended() == first
     assert not found
-
-
-def test_pairs_of_similar_sizes_share_a_program(raw, monkeypatch):
-    """Each fills at least half of the size of the first."""
-    sizes, shapes = (490, 400, 260, 310), []
-    program = chunks._registered
-
-    def noted(chunk, *arguments, **named):
-        shapes.append((chunk.source.valid.shape[1], chunk.target.valid.shape[1]))
-        return program(chunk, *arguments, **named)
-
-    monkeypatch.setattr(chunks, "_registered", noted)
-    sources, targets = (
-        [raw[2][side].replace_rows(valid=np.arange(len(raw[2][side])) < size).unpad() for size in sizes]
-        for side in (0, 1)
-    )
-    results = in_chunks(sources, targets, covariances=False)
-    assert set(shapes) == {(512, 512)}
-    for result, expected in zip(results, in_chunks(sources, targets, executor="threads"), strict=True):
-        assert max(pose_error(result.matrix, expected.matrix)) < 1e-5
-        assert np.isnan(result.covariance).all() and np.isfinite(expected.covariance).all()
 
 
 @in_both_precisions

@@ -222,6 +222,11 @@ SPREAD = np.random.default_rng(0).random((3000, 3)) * [60, 60, 3] @ ref.pose([0.
 # A room of 30 m, and circles on a sphere of 5 m.
 ROOM = 10 * np.asarray(datasets.box_room(1, points_per_frame=3000)[0].cloud.points, np.float64)
 LEVELS, AROUND = np.clip(np.rint(SPREAD[:, 0] / 6) - 5, -5, 5), 2 * np.pi * np.random.default_rng(0).random(3000)
+# A planar scan in a hall, 1.5 m from a wall, and its copies, too far apart to be among the neighbours.
+RAYS = np.stack([np.cos(2 * np.pi * np.arange(0.1, 600) / 600), np.sin(2 * np.pi * np.arange(0.1, 600) / 600)])
+WALLS = np.where(RAYS > 0, [[12], [12.5]], [[12], [1.5]])
+HALL = (RAYS / np.max(np.abs(RAYS) / WALLS, axis=0)).T + 0.02 * np.random.default_rng(0).normal(size=(600, 2))
+COPIES = np.concatenate([np.insert(HALL, 2, height, axis=1) for height in 3.0 * np.arange(5)])
 # Points, and the step to which they are rounded, metres; 0 where it does no harm.
 ROUNDED = {
     "as they are": (SPREAD, 0),
@@ -240,6 +245,7 @@ ROUNDED = {
     "height map of more points than are sampled": (height_map(70), 0),
     "sections": (np.stack([*np.sqrt(25 - LEVELS**2) * [np.cos(AROUND), np.sin(AROUND)], LEVELS], axis=1), 0),
     "height map in float32": ((height_map() + np.rint(UTM)).astype(np.float32), 0),
+    "copies of a planar scan": (COPIES, 0),
     "each of ten points five times": (np.tile(POINTS[:10], (5, 1)), 0),
 }
 
