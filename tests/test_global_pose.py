@@ -457,8 +457,10 @@ def test_a_global_pose_that_is_unsure_leaves_the_registration_unverified():
     clouds = strangers(1000)
     start = mcg.global_pose(*clouds)
     assert not start.success and start.num_inliers
-    with pytest.warns(UserWarning, match="global pose: only .* matches of features support it"):
+    with pytest.warns(UserWarning, match="global pose: only .* matches of features support it") as caught:
         unsure = mcg.register(*clouds, mcg.GICP(), init="global")
+    # And nothing of the poses that were tried.
+    assert len(caught) == 1
     assert unsure.status is mcg.Status.UNVERIFIED and not unsure.converged
     registered = mcg.register(*clouds, mcg.GICP(), init=start.matrix)
     np.testing.assert_array_equal(unsure.matrix, registered.matrix)

@@ -22,7 +22,7 @@ from mcgicp_jax._math.poses import nearest_rotation
 from mcgicp_jax._methods.icp import GICP
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.register_pair import register_pair
+from mcgicp_jax._registration.register_pair import prepared, results_of, run_pair
 from mcgicp_jax._registration.result import is_usable
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
@@ -312,6 +312,7 @@ def _verified(scene: _Scene) -> list[Candidate]:
     method = MultiChannelGICP() if scene.source.channels.shape[1] else GICP()
     distances = _VERIFIED_WITHIN[0] * scene.voxel_size, _VERIFIED_WITHIN[1] * scene.voxel_size
     options = Options(max_distance=distances, max_iterations=_VERIFIED_ITERATIONS)
+    inputs = prepared(scene.source, scene.target, method, options)
     verified: list[Candidate] = []
     started: list[np.ndarray] = []
     order = np.argsort(-poses.score, kind="stable")
@@ -324,7 +325,8 @@ def _verified(scene: _Scene) -> list[Candidate]:
         if any(scene.are_same(start, other) for other in started):
             continue
         started.append(start)
-        result = register_pair(scene.source, scene.target, method, start, options)
+        # Without the warning that a pose is doubtful: it may not be the one that is returned.
+        (result,) = results_of([run_pair(inputs, start, options)], [inputs])
         # A registration that fails, as of clouds with a few coincident points, is no evidence against the matches.
         usable = is_usable(result)
         matrix = np.array(result.matrix if usable else start)
