@@ -11,10 +11,9 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mcgicp_jax._clouds.origins import centred_pose
@@ -37,8 +36,9 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_inputs,
     warn_of_lengths,
 )
+from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.pose_derivative import Inputs
+from mcgicp_jax._registration.pose_derivative import Inputs, parameters_by
 from mcgicp_jax._registration.register_pair import (
     Run,
     prepared,
@@ -232,17 +232,11 @@ class BatchJob:
         if isinstance(run, PairResult):
             return run
         (result,) = map(verified, results_of([run], [run.inputs]))
-        leaves, structure = jax.tree.flatten(values, is_leaf=is_deferred)
-
-        def pose(*traced: Any) -> Any:
-            moved = dict(enumerate(leaves)) | dict(zip(pair.traced, traced, strict=True))
-            moved_inputs = Inputs(*jax.tree.unflatten(structure, moved.values()))._replace(prior=inputs.prior)
-            (moved_result,) = results_of([run], [moved_inputs])
-            return moved_result.centred.wxyz_xyz
-
-        parameters, vjp = jax.vjp(pose, *(leaves[i] for i in pair.traced))
-        blocks = jax.vmap(vjp)(jnp.eye(7, dtype=parameters.dtype))
-        return replace(self._result(pair.index, result, run.doubt), jacobian=tuple(map(np.asarray, blocks)))
+        leaves = jax.tree.leaves(values, is_leaf=is_deferred)
+        arrays = [leaves[i] for i in pair.traced]
+        slopes = parameters_by(inputs, run.inputs, cast(HostExecutor, run.executor), run.loop, arrays)
+        blocks = tuple(slope.astype(array.dtype) for slope, array in zip(slopes, arrays, strict=True))
+        return replace(self._result(pair.index, result, run.doubt), jacobian=blocks)
 
     def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
         """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""

@@ -219,13 +219,27 @@ def jacobian(
     array = getattr(getattr(inputs, cloud), field)
     if array is None:
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
-    (by_array,) = PoseDerivative(inputs, inputs, executor, loop, [array]).vjp([np.eye(7)], (0,))
-    if inputs.gains is not None and (cloud, field) == ("source", "channels"):
-        by_array = by_array * inputs.gains
+    (by_array,) = parameters_by(inputs, inputs, executor, loop, [array])
     pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), Motion.of(loop.state.pose.wxyz_xyz).rotation
     twist = np.zeros((6, 7))
     twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn_by_quaternion(pose[:4])
     return np.tensordot(translation_adjoint(np.asarray(inputs.source.origin)) @ twist, by_array, 1)
+
+
+def parameters_by(
+    given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult, arrays: Sequence[Any]
+) -> list[Float[np.ndarray, "7 ..."]]:
+    """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of the final pose by concrete arrays among the leaves of
+    `given`, of which `inputs` are those of the registration."""
+    channels, gains = given.source.channels, inputs.gains
+    method = with_unset_from(given.method, inputs.method)
+    registered = [inputs.source.channels if array is channels else array for array in arrays]
+    derivative = PoseDerivative(inputs._replace(method=method), inputs, executor, loop, registered)
+    slopes = derivative.vjp([np.eye(7)], tuple(range(len(arrays))))
+    return [
+        slope if gains is None or array is not channels else slope * gains
+        for slope, array in zip(slopes, arrays, strict=True)
+    ]
 
 
 def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult) -> PoseDerivative | None:
