@@ -3,6 +3,7 @@
 import re
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -378,21 +379,33 @@ def test_tie_points_and_priors_have_gradients(clouds):
     check_eager_gradient(loss, jax.tree.map(jnp.asarray, inputs))
 
 
-def test_gains_of_equalized_channels_are_constants_of_which_gradients_warn(clouds):
-    """Twice the contrast: a gradient half as large."""
+@pytest.mark.parametrize("soft_matches", [False, None])
+def test_gains_of_equalized_channels_are_constants_of_which_gradients_warn(soft_matches, clouds):
+    """Another offset changes no gradient, and twice the contrast makes it half as large."""
     source, target = clouds
+    options = HARD | {"soft_matches": soft_matches, "equalize_channels": True}
 
     def registered(channels):
-        return mcg.register(source.replace(channels=channels), target, METHOD, equalize_channels=True, **HARD)
+        return mcg.register(source.replace(channels=channels), target, METHOD, **options)
 
-    def gradient(channels):
+    def registered_by_a_worker(channels):
+        (result,) = mcg.register_batch(
+            [source.replace(channels=channels)], [target], METHOD, executor=worker, **options
+        )
+        return result
+
+    def gradient(channels, register=registered):
         with pytest.warns(UserWarning, match="equalize_channels: gain and offset"):
-            return jax.grad(lambda channels: weigh(registered(channels).matrix))(channels)
+            return jax.grad(lambda channels: weigh(register(channels).matrix))(channels)
 
+    channels, others = source.channels + 0.3, 2 * source.channels - 0.7
     for derivative in (gradient, lambda channels: registered(channels).jacobian("source", "channels")):
-        once, twice = (derivative(gain * source.channels + 0.3) for gain in (1.0, 2.0))
+        once, twice = derivative(channels), derivative(others)
         assert np.any(once)
         np.testing.assert_allclose(twice, 0.5 * once, rtol=1e-6, atol=1e-9)
+    with ThreadPoolExecutor(1) as worker:
+        by_worker = gradient(channels, registered_by_a_worker)
+    np.testing.assert_allclose(by_worker, gradient(channels), rtol=1e-6, atol=1e-9)
 
 
 def test_preprocessing_has_a_derivative():

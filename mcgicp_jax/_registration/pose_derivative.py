@@ -248,7 +248,8 @@ def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: 
         return None
     source = given.source
     if inputs.gains is not None and not is_concrete(source.channels):
-        (channels,) = blockwise(_multiplied, np.asarray(inputs.gains, source.channels.dtype), Input(source.channels))
+        gains, equalized = np.asarray(inputs.gains, source.channels.dtype), inputs.source.channels
+        (channels,) = blockwise(_equalized, gains, Input(source.channels), Input(equalized))
         source = source.replace_rows(channels=channels)
     method = with_unset_from(given.method, inputs.method)
     traced = given._replace(source=source, method=method, source_rows=inputs.source_rows)
@@ -256,8 +257,9 @@ def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: 
     return derivative if derivative.arrays else None
 
 
-def _multiplied(gains: Float[Array, "C"], channels: Rows) -> tuple[Float[Array, "n C"]]:
-    return (gains * channels.tree,)
+def _equalized(gains: Float[Array, "C"], channels: Rows, equalized: Rows) -> tuple[Float[Array, "n C"]]:
+    """The equalised channels, which have offsets, too, with their derivative by the given channels."""
+    return (equalized.tree + gains * (channels.tree - jax.lax.stop_gradient(channels.tree)),)
 
 
 _form_at = jax.jit(form_at)
