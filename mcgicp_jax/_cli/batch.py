@@ -96,9 +96,8 @@ def batch(
     finished = len(wanted) - len(missing)
     resumed = f", of which {finished:,} are in {output} and are kept, whatever the options were" if finished else ""
     print(f"pairs:     {len(wanted):,}{resumed}")
-    interrupted = False
-    if missing:
-        interrupted = _register_missing(list(missing), partial(register, missing, executor), output, rows, finished)
+    register = partial(register, missing, executor)
+    interrupted = bool(missing) and _register_missing(list(missing), register, output, rows, finished)
     rows = {key: rows[key] for key in wanted if key in rows} | rows
     _write_rows(output, rows.values())
     print(f"table:     {output}")
@@ -114,7 +113,6 @@ def batch(
 
 
 def _pairs_in(path: Path, glob: str) -> Starts:
-    """The pairs of a CSV file or of a folder, with their initial poses."""
     if path.is_dir():
         names = [cloud.name for cloud in clouds_in(path, glob).paths]
         return {(source, target, ""): None for target, source in itertools.pairwise(names)}

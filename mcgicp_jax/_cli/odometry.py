@@ -37,7 +37,6 @@ NumFrames: TypeAlias = int | Literal["all"]
 
 _FRAMES_OF_A_SCENE = 20
 _RECORDED = [name for name, dataset in DATASETS.items() if not dataset.simulated]
-_SIMULATED = [name for name, dataset in DATASETS.items() if dataset.simulated]
 _MAX_DISTANCES = ", ".join(
     f"{far:g} and {near:g} for {enumerated(list(names))}"
     for (far, near), names in itertools.groupby(DATASETS, lambda name: DATASETS[name].max_distance)
@@ -47,7 +46,7 @@ _MAX_DISTANCES = ", ".join(
 @partial(
     with_names,
     datasets=enumerated(_RECORDED, "or"),
-    scenes=enumerated(_SIMULATED, "or"),
+    scenes=enumerated([name for name, dataset in DATASETS.items() if dataset.simulated], "or"),
     max_distances=_MAX_DISTANCES,
 )
 def odometry(
