@@ -18,21 +18,20 @@ ORDER = {name: place for place, name in enumerate(("intensity", *COLORS))}
 INTENSITIES = ("intensity", "intensities", "i", "reflectance", "reflectivity", "remission")
 _ALIASES = {alias: colour for colour in COLORS for alias in (colour, colour[0], f"diffuse_{colour}")}
 _ALIASES |= dict.fromkeys(INTENSITIES, "intensity")
+_TIMES = re.compile("t|time|time_?stamp|adjusted_?time|gps_?time|offset_?time")
 # Geometry, and what files say of a point besides its colour: by PCL, LAS, VeloView, Autoware, Livox and Ouster.
 _NOT_CHANNELS = re.compile(
-    "[xyz_]|rgba?|a|(diffuse_)?alpha|n[xyz]|normal_[xyz]|curvature|vp_[xyz]|label|class|(raw_?)?classification|object|"
-    "instance|id|index|ring|line|tag|row|column|range|distance|depth|azimuth|elevation|(vertical|horizontal)_?angle|"
-    "t|time|time_?stamp|adjusted_?time|gps_?time|offset_?time|laser_?id|scan_?angle(_?rank)?|scan_?direction_?flag|"
-    "scanner_?channel|bit_fields|user_?data|point_?(source_?)?id|return_?(type|number)|num(ber_?of)?_?returns|"
-    "edge_?of_?flight_?line|key_?point|synthetic|withheld|overlap"
+    f"{_TIMES.pattern}|[xyz_]|rgba?|a|(diffuse_)?alpha|n[xyz]|normal_[xyz]|curvature|vp_[xyz]|label|class|object|index|"
+    "(raw_?)?classification|instance|id|ring|line|tag|row|column|range|distance|depth|azimuth|elevation|laser_?id|"
+    "(vertical|horizontal)_?angle|scan_?angle(_?rank)?|scan_?direction_?flag|scanner_?channel|bit_fields|user_?data|"
+    "point_?(source_?)?id|return_?(type|number)|num(ber_?of)?_?returns|edge_?of_?flight_?line|key_?point|synthetic|"
+    "withheld|overlap"
 )
-_TIMES = re.compile("(scalar_)?(t|time|time_?stamp|adjusted_?time|gps_?time|offset_?time)")
 # The bits of NaN in float32, which mark a missing packed colour.
 _NO_COLOR = np.float32(np.nan).view(np.uint32)
 
 
 def channel_name(column: str) -> str | None:
-    """Name of the channel in a column; None if the column is not a channel."""
     bare = column.removeprefix("channel_")
     if bare != column and channel_name(bare) != bare:
         return bare
@@ -65,7 +64,7 @@ def arrays_of_columns(columns: Columns) -> tuple[Float[np.ndarray, "N 3"], Float
 def times_of(columns: Columns) -> Shaped[np.ndarray, "N"] | None:
     """The first column of times that differ, in any unit; None if there is none."""
     for column, values in columns.items():
-        timed = values.dtype.kind in "fiu" and _TIMES.fullmatch(column.lower())
+        timed = values.dtype.kind in "fiu" and _TIMES.fullmatch(column.lower().removeprefix("scalar_"))
         if timed and np.isfinite(values).all() and (values != values[:1]).any():
             return values
     return None

@@ -83,9 +83,8 @@ class VoxelMap:
         finite = np.isfinite(rows).all(axis=1)
         if self._first is None and finite.any():
             self._first = np.floor(points[finite][0] / self._voxel_size)
-        first = 0.0 if self._first is None else self._first
         with messages_named(name):
-            point_keys = voxel_keys(points[finite], self._voxel_size, first)
+            point_keys = voxel_keys(points[finite], self._voxel_size, 0.0 if self._first is None else self._first)
         # Sum the rows of each voxel, then add the sums to those of the map.
         order = np.argsort(point_keys, kind="stable")
         starts = starts_of(point_keys[order])
