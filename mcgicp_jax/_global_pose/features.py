@@ -117,15 +117,15 @@ def _simple_histograms(
     near = around.present & (square > 0) & (square <= radius * radius)
     distance = jnp.sqrt(jnp.where(near, square, 1))
     line = [offset / distance for offset in offsets]
-    own, other = [axis[None] for axis in around.own_channels], list(around.near_channels)
-    side = jnp.where(alg.dot(own, other) >= 0, 1, -1).astype(square.dtype)
-    other = [side * axis for axis in other]
-    own_along, other_along = alg.dot(own, line), alg.dot(other, line)
-    swapped = jnp.abs(own_along) < jnp.abs(other_along)
-    u = [jnp.where(swapped, b, a) for a, b in zip(own, other, strict=True)]
-    n = [jnp.where(swapped, a, b) for a, b in zip(own, other, strict=True)]
+    normal, near_normal = [axis[None] for axis in around.own_channels], list(around.near_channels)
+    side = jnp.where(alg.dot(normal, near_normal) >= 0, 1, -1).astype(square.dtype)
+    near_normal = [side * axis for axis in near_normal]
+    cosine, near_cosine = alg.dot(normal, line), alg.dot(near_normal, line)
+    swapped = jnp.abs(cosine) < jnp.abs(near_cosine)
+    u = [jnp.where(swapped, b, a) for a, b in zip(normal, near_normal, strict=True)]
+    n = [jnp.where(swapped, a, b) for a, b in zip(normal, near_normal, strict=True)]
     line = [jnp.where(swapped, -axis, axis) for axis in line]
-    phi = jnp.where(swapped, -other_along, own_along)
+    phi = jnp.where(swapped, -near_cosine, cosine)
     v = alg.cross(line, u)
     length = jnp.sqrt(alg.dot(v, v))
     # Where a normal is the line between the points, the frame is undefined.
