@@ -181,7 +181,6 @@ class Mahalanobis(AbstractTerm):
 
     @property
     def matches_slide(self) -> bool:
-        """True for points, False for voxel cells."""
         return not self.method.needs_covariances
 
     def linearize(self, matches: PosedMatches) -> Linearization:

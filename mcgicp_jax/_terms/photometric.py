@@ -91,7 +91,7 @@ class Residuals(NamedTuple):
 
     values: Float[AnyArray, "*some n K"]  # r_k, metres and channel units
     slopes: Float[AnyArray, "*some n K 3"]  # derivatives of the residuals with respect to T a
-    own: Float[AnyArray, "*some n C"]  # fitted channels of the source points
+    fitted: Float[AnyArray, "*some n C"]  # channels of the source points
     products: Float[AnyArray, "*some n C"]  # g_Bᵀ R g_A, the gradient of the source multiplied by its gain
     moved: Float[AnyArray, "*some n 3"]  # T a, metres; 0 where there is no match
 
@@ -200,40 +200,39 @@ class Photometric(AbstractAdaptiveTerm):
         normal = total / jnp.sqrt(alg.inner(total, total))
         near = valid & (alg.inner(offset, offset) <= (_MAX_OFFSET * self.spacing) ** 2)
         values, slopes = [jnp.where(valid, alg.inner(normal, offset), jnp.nan)], [jnp.where(valid, normal, 0)]
-        own, products = [], []
+        fitted, products = [], []
         for channel in range(self.gains.shape[0]):
-            source_value, target_value = a.value[:, channel], b.value[:, channel]
-            measured = near & ~jnp.isnan(source_value) & ~jnp.isnan(target_value)
+            measured = near & ~jnp.isnan(a.value[:, channel]) & ~jnp.isnan(b.value[:, channel])
+            source_value, target_value = (jnp.where(measured, fit.value[:, channel], 0) for fit in (a, b))
             turned = self.gains[channel] * jnp.dot(rotation, a.gradient[:, channel].T, precision="highest")
             gradient = b.gradient[:, channel].T
             slope = 0.5 * (gradient + turned)
-            fitted = jnp.where(measured, source_value, 0)
-            predicted = jnp.where(measured, target_value, 0) + alg.inner(slope, offset)
-            residual = predicted - self.gains[channel] * fitted - self.offsets[channel]
+            predicted = target_value + alg.inner(slope, offset)
+            residual = predicted - self.gains[channel] * source_value - self.offsets[channel]
             values.append(jnp.where(measured, residual, jnp.nan))
             slopes.append(jnp.where(measured, slope, 0))
-            own.append(jnp.where(measured, fitted, jnp.nan))
+            fitted.append(jnp.where(measured, source_value, jnp.nan))
             products.append(jnp.where(measured, alg.inner(turned, gradient), 0))
-        return values, slopes, own, products
+        return values, slopes, fitted, products
 
     def sample(self, matches: PosedMatches) -> Residuals:
-        values, slopes, own, products = self._residuals(matches)
-        rows = [jnp.stack(columns, axis=1) for columns in (values, own, products)]
+        values, slopes, fitted, products = self._residuals(matches)
+        rows = [jnp.stack(columns, axis=1) for columns in (values, fitted, products)]
         moved = jnp.where(matches.valid, matches.moved, 0).T
         return Residuals(rows[0], jnp.stack(slopes).transpose(2, 0, 1), rows[1], rows[2], moved)
 
     def adapt(self, sample: Residuals, fraction: Float[AnyScalar, ""]) -> Photometric:
         xp = numpy_for(self, sample, fraction)
         # NumPy takes two thirds of the time for contiguous columns.
-        values, own, products, moved = (
-            xp.asarray(rows).T.copy() for rows in (sample.values, sample.own, sample.products, sample.moved)
+        values, fitted, products, moved = (
+            xp.asarray(rows).T.copy() for rows in (sample.values, sample.fitted, sample.products, sample.moved)
         )
         slopes = xp.asarray(sample.slopes).transpose(1, 2, 0).copy()
         gains, offsets = self.gains, self.offsets
         if self.equalizes_channels:
-            predicted = values[1:] + gains[:, None] * own + offsets[:, None]
-            gains, offsets = gain_and_offset(own.T, predicted.T)
-            values = xp.concatenate([values[:1], predicted - gains[:, None] * own - offsets[:, None]])
+            predicted = values[1:] + gains[:, None] * fitted + offsets[:, None]
+            gains, offsets = gain_and_offset(fitted.T, predicted.T)
+            values = xp.concatenate([values[:1], predicted - gains[:, None] * fitted - offsets[:, None]])
         measured = ~xp.isnan(values)
         slopes = xp.where(measured[:, None], slopes, 0)
         lengths = xp.sum(slopes**2, axis=1)
