@@ -136,11 +136,7 @@ def warn_of_shape(cloud: PointCloud, all_points: bool) -> None:
 
 
 def _suitable_voxels(grids: Sequence[Grid]) -> Voxels:
-    """One voxel size for several raw clouds, and the reason; None where their points are spread evenly.
-
-    It is the smallest at which no cloud has more than 5 % of linear neighbourhoods or more than 40,000 voxels, or a
-    larger one if neighbourhoods are thicker than 0.3 of their width and thinner there. A constant to autodiff.
-    """
+    """One voxel size for several raw clouds, by the rules of `preprocess`; None where points are spread evenly."""
     # Sizes are numbered, ten for each decade of metres; None stands for all points.
     step: int | None = None
     reason = ""
