@@ -70,7 +70,6 @@ class AbstractFrames(Sequence[Frame]):
         return _Cropped(self, min_range, max_range)
 
     def _row(self, index: int) -> int:
-        """The non-negative index that is equivalent to `index`."""
         row = operator.index(index)
         if not -len(self) <= row < len(self):
             raise IndexError(f"index: expected {-len(self)} to {len(self) - 1}, got {row}")
@@ -173,7 +172,6 @@ def check_scene(points_per_frame: int, noise: float, most: int = 10_000_000) -> 
 
 
 def read_image(path: str | os.PathLike[str]) -> Picture:
-    """Read an image as 8-bit red, green and blue."""
     return np.asarray(_open(path).convert("RGB"))
 
 

@@ -109,13 +109,10 @@ def random_rays(rng: np.random.Generator, size: int) -> Rays:
 
 
 def spinning_rays(rng: np.random.Generator, size: int, beams: int, lowest: float, highest: float) -> Rays:
-    """About `size` unit rays of one turn of a LiDAR: x ahead, z up, beams between two elevations in radians.
-
-    The turn starts at a random azimuth, and each beam has its own azimuth offset, as in a real LiDAR.
-    """
+    """About `size` unit rays of one turn of a LiDAR: x ahead, z up, beams between two elevations in radians."""
     columns = max(round(size / beams), 1)
     beam = np.arange(beams)
-    # Multiples of the golden ratio spread the beams' offsets evenly over a column.
+    # As in a real LiDAR, each beam has its own offset. Multiples of the golden ratio spread them evenly over a column.
     azimuth = 2 * np.pi / columns * (np.arange(columns)[:, None] + rng.uniform() + 0.618034 * beam % 1)
     elevation = np.broadcast_to(np.linspace(lowest, highest, beams), azimuth.shape)
     x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)

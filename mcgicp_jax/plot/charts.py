@@ -82,7 +82,6 @@ def graph(graph: PoseGraphResult, *, path: File = None) -> Figure:
 
 
 def _chart() -> tuple[Figure, Any]:
-    """A figure and its only panel, of equal scales in metres."""
     figure = new_figure(7, 5)
     panel = figure.subplots()
     panel.set(xlabel="metres", ylabel="metres", aspect="equal", adjustable="datalim")
