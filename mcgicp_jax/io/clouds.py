@@ -78,10 +78,10 @@ def _known_format(path: Path, columns: int | None = None) -> Format | None:
             _not_written,
             lambda file: inner.is_cloud(_decompressed(file, os.fstat(file.fileno()).st_size)[0]),
         )
-    known = FORMATS.get("".join(suffixes[-2:])) or FORMATS.get("".join(suffixes[-1:]))
-    if columns is not None and known is not None and known.read is arrays.read_kitti:
-        return replace(known, read=partial(arrays.read_kitti, columns=columns))
-    return known
+    file_format = FORMATS.get("".join(suffixes[-2:])) or FORMATS.get("".join(suffixes[-1:]))
+    if columns is not None and file_format is not None and file_format.read is arrays.read_kitti:
+        return replace(file_format, read=partial(arrays.read_kitti, columns=columns))
+    return file_format
 
 
 class _Decompressed(io.BytesIO):

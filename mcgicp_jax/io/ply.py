@@ -52,7 +52,5 @@ def read_ply(file: BinaryIO, size: int) -> PointCloud:
 def write_ply(file: BinaryIO, cloud: PointCloud) -> None:
     plyfile = optional_module("plyfile", "io", "writing .ply files")
     columns = columns_of(cloud)
-    rows = np.empty(len(cloud), [(name, values.dtype) for name, values in columns.items()])
-    for name, values in columns.items():
-        rows[name] = values
+    rows = np.rec.fromarrays(list(columns.values()), [(name, values.dtype) for name, values in columns.items()])
     plyfile.PlyData([plyfile.PlyElement.describe(rows, "vertex")], byte_order="<").write(file)

@@ -173,7 +173,6 @@ def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
 
 
 def _rows(lines: list[tuple[int, list[str]]], tag: str) -> tuple[list[int], Float[np.ndarray, "N _"]]:
-    """Line numbers and numbers of the lines with a tag."""
     whole, width = _WIDTHS[tag]
     line_numbers, rows = [], []
     for line, words in lines:
