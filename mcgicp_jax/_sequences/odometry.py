@@ -272,9 +272,7 @@ class _Sensor(Iterator[OdometryStep]):
             if not len(self.world):
                 raise ValueError(f"map_radius: expected metres within which the sensor sees points, got {self.radius}")
         self.cloud = cloud
-        graph = None
-        if self.trajectory is not None:
-            graph = Lazy(partial(self.trajectory.graph, *self.trajectory.size))
+        graph = None if self.trajectory is None else Lazy(partial(self.trajectory.graph, *self.trajectory.size))
         if result is None:
             return OdometryStep(self.pose, cloud, None, self.is_lost, graph)
         registration = Lazy(partial(computed, verified(result)))
