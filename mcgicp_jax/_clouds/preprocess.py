@@ -93,7 +93,7 @@ def preprocess(
 
 def preprocessed_in(
     grid: Grid | None,
-    cloud: PointCloud | Values,
+    cloud: PointCloud,
     voxel_size: VoxelSize | Voxels,
     num_neighbors: int,
     search: AbstractSearch | None,
@@ -101,7 +101,6 @@ def preprocessed_in(
 ) -> PointCloud:
     """`preprocess` with the grid of `voxels_and_grids`, if known. `checked`: look at neighbourhoods, for warnings."""
     check_preprocessing(voxel_size, num_neighbors)
-    cloud = as_cloud("cloud", cloud)
     if not is_concrete(cloud):
         values = primal(cloud)
         if is_concrete(values):

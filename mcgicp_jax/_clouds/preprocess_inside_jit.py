@@ -58,10 +58,8 @@ def traced_neighbors(cloud: PointCloud, num_neighbors: int, search: AbstractSear
 def _valid_first(cloud: PointCloud) -> PointCloud:
     """The cloud with its valid rows first, in their order; the last of them fills the others."""
     valid = jnp.asarray(cloud.valid)
-    rows = jnp.argsort(~valid, stable=True)
     place = jnp.arange(valid.size)
-    rows = rows[jnp.minimum(place, jnp.maximum(jnp.sum(valid) - 1, 0))]
-
+    rows = jnp.argsort(~valid, stable=True)[jnp.minimum(place, jnp.maximum(jnp.sum(valid) - 1, 0))]
     arrays: dict[str, Any] = {}
     for name in ("points", "channels", "channel_valid", "covariances"):
         array = getattr(cloud, name)
