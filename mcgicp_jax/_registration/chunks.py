@@ -244,16 +244,13 @@ def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
 
 def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
     """The pair, padded to the smallest of the `sizes` of earlier ones that suits; without one, its own joins them."""
-    own = pair.source.valid.size, pair.target.valid.size
-    if own in sizes:
+    rows = pair.source.valid.size, pair.target.valid.size
+    if rows in sizes:
         return pair
-
-    def suits(size: tuple[int, int]) -> bool:
-        return all(rows <= each <= max(_FEW_ROWS, 2 * rows) for rows, each in zip(own, size, strict=True))
-
-    suitable = list(filter(suits, sizes))
+    most = [max(_FEW_ROWS, 2 * count) for count in rows]
+    suitable = [size for size in sizes if all(a <= b <= c for a, b, c in zip(rows, size, most, strict=True))]
     if not suitable:
-        sizes.append(own)
+        sizes.append(rows)
         return pair
     source, target = min(suitable, key=np.prod)
     return pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
@@ -305,7 +302,6 @@ def _registered(
 
 
 def _with_neighbors(clouds: PointCloud, search: AbstractSearch, num_neighbors: int) -> PointCloud:
-    """Stacked clouds with their neighbours."""
     if clouds.deferred_neighbors is not None:
         return clouds
     find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)

@@ -114,7 +114,7 @@ def warn_of_extensions(method: AbstractMethod, executor: HostExecutor, loop: Loo
     motion = Motion.of(loop.state.pose.wxyz_xyz)
     for term in loop.terms:
         sums = executor.sums(motion, loop.matches, (term,), np.bool_(False))
-        extensions = [each for each in (term, term.robust) if _is_extension(each)]
+        extensions = [part for part in (term, term.robust) if _is_extension(part)]
         if extensions and not np.isfinite(sums.table).all():
             warn(
                 f"{type(extensions[0]).__name__}: expected finite numbers, got NaN or infinity at the matches after "

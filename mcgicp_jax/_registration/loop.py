@@ -118,7 +118,7 @@ class Problem(eqx.Module):
             if term.robust is None:
                 return term
             scale = numpy_for(term.robust.scale, factor).asarray(term.robust.scale) * factor
-            return eqx.tree_at(lambda each: each.robust.scale, term, scale)
+            return eqx.tree_at(lambda term: term.robust.scale, term, scale)
 
         return tuple(map(widened, terms))
 

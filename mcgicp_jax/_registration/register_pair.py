@@ -103,7 +103,6 @@ def register_pair(
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
-    """`register` from a given initial pose, with its options as one object."""
     given = prepared(source, target, method, options, tie_points, prior)
     if init is None and prior is not None:
         init = prior[0]
@@ -319,7 +318,6 @@ def problem_of(
 
 
 def _warn_of_near_points(run: Run) -> None:
-    """Warn of a pose that is DEGENERATE since points near the sensor count as no evidence."""
     points, near = np.asarray(run.inputs.source.points)[run.inputs.source.valid], run.problem.settings.near
     if not (np.square(points).sum(axis=1) < near**2).any():
         return
@@ -334,7 +332,6 @@ def _warn_of_near_points(run: Run) -> None:
 
 
 def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | None:
-    """The source rows that `max_source_points` leaves; None for all."""
     limit = options.max_source_points
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
@@ -373,7 +370,6 @@ def _final_pose(run: Run) -> Pose:
 
 
 def _nearest_points(run: Run) -> Correspondences:
-    """Nearest matches in position at the final pose."""
     source, target = run.inputs[:2]
     limit = run.problem.settings.fine_distance
     return find_correspondences(source, target, _final_pose(run), PointToPoint(), max_distance=limit, search=run.search)
@@ -401,7 +397,6 @@ def _at_scales(given: Inputs, voxel_sizes: Sequence[float]) -> Iterator[Inputs]:
     """The inputs of the registrations for these voxel sizes, metres; the last one gives the result. Cells have the last
     size, and GICP registers smaller voxels at the others. Methods without cells register the voxels of each size, and
     then the clouds."""
-
     method, sides = given.method, {"source": given.source, "target": given.target}
     if method.needs_covariances and len(voxel_sizes):
         for size in voxel_sizes[:-1]:

@@ -64,7 +64,6 @@ _LITTLE_IN_COMMON = 0.6
 # Number of matches that are compared. Four times as many do not separate poses any better.
 _SAMPLE = 1024
 
-
 AnyRun = TypeVar("AnyRun")
 
 
@@ -180,8 +179,8 @@ def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) ->
     targets = executor.within(motion, matches).indices[0]
     matched, xp = targets >= 0, numpy_for(targets)
     targets = xp.maximum(targets, 0)
-    own = rows if inputs.source_rows is None else inputs.source_rows[rows]
-    source, target = local_geometries(inputs.source, inputs.target, inputs.method.uses_channels, (own, targets))
+    both_rows = rows if inputs.source_rows is None else inputs.source_rows[rows], targets
+    source, target = local_geometries(inputs.source, inputs.target, inputs.method.uses_channels, both_rows)
     turned = motion._replace(translation=np.zeros(3, points.dtype)).move(source.normal).T
     offsets, thicknesses = others[targets] - motion.move(points[rows]).T, (_thickness(source), _thickness(target))
     misfit, agreement = agreement_of(offsets, (turned, target.normal), thicknesses, matched)

@@ -74,9 +74,9 @@ def _centred_prior(given: GivenPrior, source: PointCloud, target: PointCloud) ->
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     if is_concrete(covariance, source.points, source.origin):
         return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, source))
-    fixed, given = None, primal(covariance)
-    if is_concrete(given):
-        values, rows = _principal_rows(np.asarray(given, np.float64))
+    fixed, value = None, primal(covariance)
+    if is_concrete(value):
+        values, rows = _principal_rows(np.asarray(value, np.float64))
         fixed = _orthonormal(rows[values <= _LEAST_EIGENVALUE])
     return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin))
 

@@ -74,7 +74,15 @@ class TracedExecutor(AbstractExecutor):
         taken = jnp.arange(source.valid.size) % settings.stride(status, state.num_iterations) == 0
         source = source._replace(valid=source.valid & taken)
         if any(term.by_position for term in problem.terms):
-            source, target = (_without_descriptors(status != COARSE, side) for side in (source, target))
+            # In the fine phase, in position alone.
+            factor = jnp.where(status != COARSE, 0, 1).astype(source.points.dtype)
+            source, target = (
+                side._replace(
+                    descriptors=factor * side.descriptors,
+                    penalty=None if side.penalty is None else factor * side.penalty,
+                )
+                for side in (source, target)
+            )
         limit, pose = settings.max_distance, state.pose.wxyz_xyz
         indices = self._search.nearest_traced(pose, source, target, limit, running, problem.num_candidates)
         matches = Matches.of(source, target, indices, settings.distance(status))
@@ -139,10 +147,3 @@ def differentiable(loop: LoopResult, problem: Problem, search: AbstractSearch | 
     model = Model(match_surfaces(source, target, matches), with_numbers_of(problem.terms, loop.terms), problem.fusion)
     pose = with_derivative(state.pose.wxyz_xyz, root_of(state, fixed.fusion), model)
     return state._replace(pose=jaxlie.SE3(pose))
-
-
-def _without_descriptors(where: Bool[Array, ""], rows: SearchPoints) -> SearchPoints:
-    """Where `where` is True, the rows for a search in position alone: descriptors and penalties are set to 0."""
-    factor = jnp.where(where, 0, 1).astype(rows.points.dtype)
-    penalty = None if rows.penalty is None else factor * rows.penalty
-    return SearchPoints(rows.points, factor * rows.descriptors, rows.valid, penalty)
