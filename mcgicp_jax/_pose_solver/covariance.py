@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.local_geometry import SurfaceNoise, searched
@@ -97,9 +97,7 @@ def discounts_and_radius(
     estimates the observable fraction 1 − β. The same holds for noisy channels. Medians, since the plane fits fail at
     edges.
 
-    Args:
-        sample: of matches.
-        num_channels: number of channels with a nonzero weight α.
+    `num_channels` is that of channels with a nonzero weight α.
     """
     xp = numpy_for(sample, num_channels)
     seen, expected, quotient, neighborhood_radius = median(xp.stack([xp.asarray(column) for column in sample]))
@@ -161,7 +159,10 @@ def scores_of(
         # In units of the data about their centre, so that cells do not depend on the unit of length or on the origin.
         relative = 0.5 * (source.neighborhood_radius + target.neighborhood_radius) / frame.neighborhood_radius
         per_radius = jnp.maximum(frame.radius / (edge * frame.neighborhood_radius), _LEAST_CELLS)
-        cells = _cells(arms * per_radius, matched.valid, relative, frame.num_cells)
+        # Cell sizes follow the point density, rounded to powers of two.
+        level = jnp.round(jnp.log2(jnp.where(matched.valid & (relative > 0), relative, 1)))
+        cell = jnp.floor(jnp.where(matched.valid, arms * per_radius / 2.0**level, 0)).astype(jnp.int32)
+        cells = cell_numbers((*cell, level.astype(jnp.int32)), frame.num_cells)
     if responding is not None:
         seen = linearize_at(motion, matched, responding)[1]
         stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, total.force - seen.force), axis=1)
@@ -209,15 +210,6 @@ def _tangent_stiffness(
     still = jnp.zeros(3, posed.moved.dtype)
     columns = [-counts * jax.jvp(force, (still,), (axis,))[1] for axis in jnp.eye(3, dtype=still.dtype)]
     return jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
-
-
-def _cells(
-    points: Float[Array, "3 N"], valid: Bool[Array, "N"], size: Float[Array, "N"], num_cells: Int[AnyScalar, ""]
-) -> Int[Array, "N"]:
-    """Hash of the cell that contains each point. Cell sizes follow the point density, rounded to powers of two."""
-    level = jnp.round(jnp.log2(jnp.where(valid & (size > 0), size, 1)))
-    cell = jnp.floor(jnp.where(valid, points / 2.0**level, 0)).astype(jnp.int32)
-    return cell_numbers((*cell, level.astype(jnp.int32)), num_cells)
 
 
 class Moments(NamedTuple):

@@ -133,7 +133,7 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
     seen, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free + fixed)))
     basis = basis @ turn
     # Where the channels disagree, the directions stay those along which the pose was updated.
-    forms = geometry, *(twist_form(each / total, radius) for each in (sums.agreement, sums.surplus))
+    forms = geometry, *(twist_form(moments / total, radius) for moments in (sums.agreement, sums.surplus))
     shares, agreed, surplus = (jnp.sum(basis * (form @ basis), axis=0) for form in forms)
     agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
     channels = jnp.where((seen > 0) & (agreed < _AGREE * seen), agreed - _AGREE * seen, seen)

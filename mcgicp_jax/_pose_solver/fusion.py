@@ -47,8 +47,7 @@ def constrained_by_pose_form(directions: Directions, information: Float[Array, "
 def fuse(
     pose: jaxlie.SE3, center: Float[Array, "3"], directions: Directions, moments: Moments, form: PoseForm
 ) -> Fusion:
-    """The equation of the pose from the end of a first registration, see `register`: its pose and `Sums.center`, to
-    which `form` refers, its directions as in the loop, and the moments of its scores."""
+    """Equation of the pose from the end of a first registration, see `register`; `form` refers to pose and center."""
     radius = jnp.asarray(directions.radius)
     motion = Motion.of(pose.wxyz_xyz)
     measurements = PoseMeasurements(*motion, center, radius, form)
@@ -58,7 +57,7 @@ def fuse(
     response, scatter = response_and_scatter(moments, radius)
     # Equal clouds: no residual is more precise than the rounding of float32.
     scatter = scatter + jnp.finfo(jnp.float32).eps ** 2 * radius * response
-    response, scatter = (jnp.where(both, basis.T @ each @ basis, others) for each in (response, scatter))
+    response, scatter = (jnp.where(both, basis.T @ matrix @ basis, others) for matrix in (response, scatter))
     # One LAPACK call after the other: two batched ones at once can deadlock.
     gain = jnp.where(both, response @ jnp.linalg.inv(scatter), 0)
     information = jnp.where(both, gain @ response, 0)

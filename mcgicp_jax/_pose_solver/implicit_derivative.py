@@ -91,11 +91,8 @@ def with_derivative(pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -
     theorem).
 
     The derivative is evaluated at the root, which Newton's method finds from the pose. It is zero if `root.usable` is
-    False or Newton's method does not converge. A second derivative raises `NotImplementedError`.
-
-    Args:
-        pose: `jaxlie.SE3.wxyz_xyz`; a constant to autodiff.
-        model: θ, the differentiable inputs.
+    False or Newton's method does not converge. A second derivative raises `NotImplementedError`. The pose,
+    `jaxlie.SE3.wxyz_xyz`, is a constant to autodiff; the model is θ.
     """
     return pose
 

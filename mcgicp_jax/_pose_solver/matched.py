@@ -109,7 +109,6 @@ class Matched(eqx.Module):
         return PosedMatches(self.source, self.target, moved, motion.rotation, self.valid)
 
     def within(self, motion: Motion, max_distance: Float[Array, ""]) -> Matched:
-        """The matches within `max_distance` metres at a pose."""
         _, near = distances_within(motion.move(self.source.points), self.target.points, max_distance)
         return eqx.tree_at(lambda matched: matched.valid, self, self.valid & near)
 
@@ -200,12 +199,16 @@ def linearize_at(
 
 
 def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Array, "n"]:
-    """Softmax over the valid candidates of each source point; 0 for source points without any."""
+    """Softmax over the valid candidates of each source point."""
     highest = jax.lax.stop_gradient(jnp.max(jnp.where(valid, logits, -jnp.inf), axis=0))
     shifted = jnp.where(valid, logits - jnp.where(jnp.isfinite(highest), highest, 0), 0)
-    exponentials = jnp.where(valid, jnp.exp(shifted), 0)
-    total = jnp.sum(exponentials, axis=0)
-    return (exponentials / jnp.where(total > 0, total, 1)).reshape(-1)
+    return normalized(jnp.where(valid, jnp.exp(shifted), 0))
+
+
+def normalized(weights: Float[Array, "m N"]) -> Float[Array, "n"]:
+    """The weights of the candidates of each source point, divided by their sum; 0 for points without any."""
+    total = jnp.sum(weights, axis=0)
+    return (weights / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
 def adapted(

@@ -96,7 +96,6 @@ class PoseMeasurements(eqx.Module):
     Attributes:
         rotation, translation: T₀, the pose to which `form` refers.
         center, radius: of the points that are matched there, metres.
-        form: of tie points and prior.
     """
 
     rotation: Float[AnyArray, "3 3"]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.observability import agreement
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
+from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at, normalized
 from mcgicp_jax._terms.base import AbstractTerm, PosedMatches
 
 # Observability that cells have in common by chance: planes whose noise is a third to a half of the edge of a cell had
@@ -109,7 +109,7 @@ def sums_of(
     *position, count = jnp.dot(with_one(posed.moved), mask, precision="highest")
     center = jnp.stack(position) / jnp.maximum(count, 1)
     h = with_one(mask * (posed.moved - center[:, None]))
-    share = _share(counts, matched.num_candidates)
+    share = normalized(counts.reshape(matched.num_candidates, -1))
     numbers = [
         mask,
         alg.inner(total.residual, total.force),
@@ -166,13 +166,6 @@ def _first_of_each(mask: Float[Array, "n"], num_candidates: int) -> Float[Array,
         return mask
     by_candidate = mask.reshape(num_candidates, -1)
     return jnp.where(jnp.cumsum(by_candidate, axis=0) == 1, by_candidate, 0).reshape(-1)
-
-
-def _share(counts: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
-    """The weights of the candidates of each source point, divided by their sum; 0 for points without any."""
-    by_candidate = counts.reshape(num_candidates, -1)
-    total = jnp.sum(by_candidate, axis=0)
-    return (by_candidate / jnp.where(total > 0, total, 1)).reshape(-1)
 
 
 def observability(

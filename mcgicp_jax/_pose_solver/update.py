@@ -74,8 +74,13 @@ def solve_update(
     # optimistix keeps its step sizes in the default precision, and fails on float32 data where x64 is on.
     root, columns = roots[0].astype(float), basis.astype(float)
     twist = basis @ _least_squares(root, columns).value.astype(dtype)
+    # θ a from 2 s, see `_residuals`.
+    square = 0.25 * (twist[3:] @ twist[3:])
+    turned = square > 0
+    tangent = jnp.sqrt(jnp.where(turned, square, 1))
+    turn = twist[3:] * jnp.where(turned, jnp.arctan(tangent) / tangent, 1)
     return Update(
-        twist=jnp.concatenate([twist[:3] * radius, _rotation_vector(twist[3:])]),
+        twist=jnp.concatenate([twist[:3] * radius, turn]),
         information=unit_information,
         degenerate=~jnp.all(pivots[1, :6] > rounding(jnp.diagonal(unit_information))),
     )
@@ -213,11 +218,3 @@ def _residuals(along: Float[Array, "6"], args: tuple[Float[Array, "13 13"], Floa
     rotation = 2 / (1 + half @ half) * (cross + cross @ cross)
     change = jnp.concatenate([rotation, twist[:3, None]], axis=1)
     return root.T @ jnp.append(change.reshape(12), 1)
-
-
-def _rotation_vector(twice: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Rotation vector θ a of `twice` = 2 s, twice the Rodrigues vector s = tan(θ/2) a."""
-    square = 0.25 * (twice @ twice)
-    turned = square > 0
-    tangent = jnp.sqrt(jnp.where(turned, square, 1))
-    return twice * jnp.where(turned, jnp.arctan(tangent) / tangent, 1)

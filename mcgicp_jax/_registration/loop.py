@@ -69,7 +69,6 @@ class Problem(eqx.Module):
 
     Attributes:
         start: the initial pose.
-        source, target: the surfaces of both clouds.
         terms: the residuals of each correspondence, before any number is adapted.
         measurements: tie points and prior: weighed by the residuals in a first registration, then as a `Fusion`; None
             if there are none.
@@ -139,13 +138,11 @@ class State(NamedTuple):
     Attributes:
         pose: the updated pose; once the loop has ended, the pose at which `sums` were measured.
         status: `COARSE`, `RUNNING` or `SETTLED` (negative) while the loop runs, then the value of a `Status`.
-        num_iterations: number of updates so far.
         since: (6,) sum of the updates since the last iteration whose number is a power of two, metres and radians.
         extent: largest cost, over these updates, of moving the matched points by `since`.
         sums: at the pose before the update; this and the following are None before the first step on the host.
         information: (6, 6) at the pose before the update, about the centroid, lengths in units of the radius.
         directions: at the pose before the update, about the centroid; None for `estimate_pose`.
-        record: of this step.
     """
 
     pose: jaxlie.SE3
@@ -163,7 +160,6 @@ class LoopResult(NamedTuple):
     """The loop after some steps.
 
     Attributes:
-        state: after the last step.
         matches: at the pose before the last update; None before the first.
         terms: as they were at that pose.
         history: records of the steps; arrays with one entry for each possible step inside transformations.

@@ -110,8 +110,7 @@ def register_pair(
 
 
 def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> RegistrationResult:
-    """The result of `run(given, *arguments, traced=False)`, such as `run_pair`; differentiable by `given` alone. Here
-    it is decided whether a registration runs on the host or is traced."""
+    """The result of `run`, such as `run_pair`, on the host or traced, as is decided here; differentiable by `given`."""
     values = given.values()
     numbers = [argument.numbers if isinstance(argument, Options) else argument for argument in arguments]
     if not is_concrete(values, numbers):

@@ -96,10 +96,8 @@ class Doubt(NamedTuple):
     """Why a registration may have left a right initial pose.
 
     Attributes:
-        fit: at its pose.
         moved: how far it has moved the points, metres.
         little: whether the views have little in common.
-        few: whether there are few matches.
         by_shape: whether there are few matches, and no channel constrains the pose.
         changing: whether the one reason is that its pose is still changing.
     """
@@ -121,9 +119,6 @@ class Candidate(Generic[AnyRun]):
     """A registration from the initial pose.
 
     Attributes:
-        run: the registration.
-        state: at its end.
-        fit: at its pose.
         moved: how far it has moved the points, metres.
         max_distance: that it used, metres: the coarse and the fine one, or one for both.
     """
