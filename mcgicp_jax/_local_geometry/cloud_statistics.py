@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, numpy_for
 from mcgicp_jax._compute.messages import warn
-from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry
+from mcgicp_jax._local_geometry.local_geometry import Geometries
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._math.statistics import median, of_known, sampled_rows
 from mcgicp_jax._search.base import Correspondences
@@ -51,7 +51,11 @@ def channel_noise(
         residuals.append(xp.where(counts[:-1], deviations, xp.nan))
         values.append(_channel_values(cloud))
         sampled.append(xp.where(counts[:-1].T, values[-1][rows], xp.nan))
-        across.append(xp.where(counts[-1], _variance_along_normal(local), xp.nan))
+        xx, xy, xz, yy, yz, zz = local.covariance.T
+        x, y, z = local.normal.T
+        with np.errstate(over="ignore", invalid="ignore"):
+            variance = xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
+        across.append(xp.where(counts[-1], variance, xp.nan))
     sigma = median(xp.concatenate(residuals, axis=1))
     low, high = _inner_range(xp.concatenate(sampled)[::_STRIDE])
     clipped = xp.concatenate(values)
@@ -89,13 +93,6 @@ def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:
     owner = xp.repeat(xp.arange(len(samples)), samples[0][0].size)
     rows, counts = (xp.concatenate(parts) for parts in zip(*samples, strict=True))
     return rows, (owner == xp.arange(len(samples))[:, None]) & counts
-
-
-def _variance_along_normal(local: LocalGeometry) -> Float[AnyArray, "N"]:
-    xx, xy, xz, yy, yz, zz = local.covariance.T
-    x, y, z = local.normal.T
-    with np.errstate(over="ignore", invalid="ignore"):
-        return xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
 
 
 def _channel_values(cloud: PointCloud) -> Float[AnyArray, "N C"]:

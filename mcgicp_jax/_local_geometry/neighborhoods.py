@@ -59,7 +59,6 @@ class Neighborhoods(NamedTuple):
 
     @property
     def given_covariance(self) -> Float[AnyArray, "6 n"] | None:
-        """`given` as symmetric matrices."""
         return None if self.given is None else alg.symmetric_from_matrix(jnp.asarray(self.given))
 
     def offset(self, axis: int) -> Float[AnyArray, "k n"]:
