@@ -143,7 +143,7 @@ Method = TypeVar("Method", bound=AbstractMethod)
 
 def with_unset_from(method: Method, resolved: Method) -> Method:
     return jax.tree.map(
-        lambda own, other: other if own is None else own, method, resolved, is_leaf=lambda leaf: leaf is None
+        lambda value, other: other if value is None else value, method, resolved, is_leaf=lambda leaf: leaf is None
     )
 
 

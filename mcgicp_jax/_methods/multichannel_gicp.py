@@ -129,13 +129,13 @@ class MultiChannelGICP(base.AbstractGeneralized):
         covariance, weights, floor = (put_on_cpu(xp.asarray(number, epsilon.dtype)) for number in numbers)
         if self.channel_covariance is not None or self.min_eigenvalue is not None:
             floor = self.min_eigenvalue
-        chosen = eqx.tree_at(
+        resolved = eqx.tree_at(
             lambda method: (method.channel_covariance, method.channel_weights, method.min_eigenvalue),
             self,
             (covariance, weights, floor),
             is_leaf=lambda leaf: leaf is None,
         )
-        return base.with_unset_from(self, chosen)
+        return base.with_unset_from(self, resolved)
 
     def terms(
         self, source: PointCloud, target: PointCloud, robust: AbstractKernel | None, equalize_channels: bool

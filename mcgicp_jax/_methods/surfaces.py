@@ -50,7 +50,6 @@ class SurfaceTable:
         table: of `Surface`, and of its `noise` if `observed`.
         rows: (n,) those that are used; None for all.
         search: the points, those of `rows`, as input of the search.
-        observed: as in `surface_pair`.
     """
 
     table: ComputedTable
@@ -90,7 +89,6 @@ class SurfacePair(NamedTuple):
 
     Attributes:
         method: with its unset parameters chosen from the data.
-        terms: the residuals of each correspondence.
         source, target: the surfaces of both clouds; tables if everything is concrete.
     """
 
@@ -173,8 +171,8 @@ def resolved(
 
     def geometries(rows: tuple[Any, Any]) -> tuple[LocalGeometry, LocalGeometry]:
         if whole is None or is_concrete(source, target):
-            own = rows[0] if source_rows is None else source_rows[rows[0]]
-            return local_geometries(source, target, method.uses_channels, (own, rows[1]), num_threads)
+            rows = rows if source_rows is None else (source_rows[rows[0]], rows[1])
+            return local_geometries(source, target, method.uses_channels, rows, num_threads)
         # Inside transformations all rows are needed anyway.
         of_source, of_target = (jax.tree.map(itemgetter(i), local) for local, i in zip(whole(), rows, strict=True))
         return of_source, of_target
