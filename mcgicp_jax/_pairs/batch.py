@@ -151,8 +151,7 @@ def _pairs(
     init: Iterable[Start] | Start,
     priors: Iterable[GivenPrior | None] | None,
 ) -> tuple[Iterator[Pair], int | None]:
-    """A lazy iterator of the pairs, and their number, None if it is not known; arguments common to all pairs are
-    checked immediately."""
+    """A lazy iterator of the pairs, and their number if it is known; what is common to all pairs is checked at once."""
     if isinstance(init, str) and init != "global":
         raise ValueError(f'init: expected a pose, "global", or one per pair, got {init!r}')
     sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init, "priors": priors}

@@ -196,8 +196,7 @@ class _Start:
             self.idle += time.perf_counter() - begin
 
     def has_ended(self, pair: Pair) -> bool:
-        """Whether the processes run; starts them if they pay. `pair` is the next one, of which it is tried whether it
-        can be sent."""
+        """Whether the processes run; starts them if they pay and can be sent the next pair."""
         if not self._possible:
             return False
         try:
@@ -228,14 +227,14 @@ class _Start:
         # As many as were sent, if nobody knows.
         left = pair.index if self._count is None else self._count - pair.index
         # n processes were (n + 1) / 2 times as quick as threads: 1.5 times on two cores, 8.6 times on sixteen.
-        each = by_threads * (1 - 2 / (self._num_workers + 1))
+        saved = by_threads * (1 - 2 / (self._num_workers + 1))
         start = 0.0 if Processes.are_warm else _START + COMPILATIONS.seconds
-        if self._sending is None and left * each > _PAYS * start:
+        if self._sending is None and left * saved > _PAYS * start:
             begin = time.perf_counter()
             # Functions are sent with all that they refer to.
             cloudpickle.dumps(_as_numpy(pair))
             self._sending = time.perf_counter() - begin
-        return self._sending is not None and left * (each - self._sending) > _PAYS * start
+        return self._sending is not None and left * (saved - self._sending) > _PAYS * start
 
 
 class ChunkedExecutor:
@@ -243,9 +242,7 @@ class ChunkedExecutor:
 
     A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
     failed chunks are suspects, submitted again at the end one by one: only those that fail alone get `WORKER_FAILED`.
-
-    Args:
-        at_home: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
+    `at_home`: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
     """
 
     def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False):

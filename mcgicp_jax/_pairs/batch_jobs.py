@@ -308,8 +308,8 @@ class BatchJob:
                     again.append(threads.submit(register, pair))
                     continue
                 source, target = pair.inputs[:2]
-                used = np.ones(min(len(source), most or len(source)), bool)
-                result = registration_of(ended.state, ended.assessment, ended.history, source, target, used)
+                matchable = np.ones(min(len(source), most or len(source)), bool)
+                result = registration_of(ended.state, ended.assessment, ended.history, source, target, matchable)
                 is_doubtful = result.status is Status.UNVERIFIED
                 doubt = pair.doubt or (doubt_of_patterns(source) if is_doubtful else "")
                 yield self._result(pair.index, pair.checked(result), doubt)
@@ -347,13 +347,6 @@ class BatchJob:
         return PairResult(index, computed(result), doubt)
 
 
-def _is_small(pair: Pair) -> bool:
-    """Whether the pair is quickly prepared: arrays, not what is still to be read, and a pose that need not be found."""
-    arrays = (cloud.points if isinstance(cloud, PointCloud) else cloud for cloud in (pair.source, pair.target))
-    shapes = [array.shape if isinstance(array, np.ndarray | jax.Array) else () for array in arrays]
-    return not isinstance(pair.init, str) and all(0 < len(shape) <= 2 and shape[0] <= _SMALL for shape in shapes)
-
-
 def _invalid(index: int, error: ValueError) -> PairResult:
     return PairResult(index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
@@ -386,7 +379,10 @@ def _computed_ahead(
     """Yield `function(pair)` in order, with up to `count` calls ahead, or `_SMALL_AHEAD` where pairs are small."""
     futures: collections.deque[Future[Any]] = collections.deque()
     for pair in pairs:
-        small = _is_small(pair)
+        # Quickly prepared: arrays, not what is still to be read, and a pose that need not be found.
+        arrays = (cloud.points if isinstance(cloud, PointCloud) else cloud for cloud in (pair.source, pair.target))
+        shapes = [array.shape if isinstance(array, np.ndarray | jax.Array) else () for array in arrays]
+        small = not isinstance(pair.init, str) and all(0 < len(shape) <= 2 and shape[0] <= _SMALL for shape in shapes)
         futures.append((for_small if small else for_others).submit(function, pair))
         while len(futures) > (_SMALL_AHEAD if small else count):
             yield futures.popleft().result()

@@ -21,7 +21,7 @@ from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, with_unset_from
 from mcgicp_jax._methods.surfaces import differentiable_inputs, surface_pair
-from mcgicp_jax._pose_solver.matched import Motion, adapted, linearize_at, matched_rows, sample_of_term
+from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, linearize_at, matched_rows, sample_of_term
 from mcgicp_jax._registration.input_checks import check_matches, warn_of_estimated_parameters
 from mcgicp_jax._search.base import Correspondences
 from mcgicp_jax._terms.base import AbstractAdaptiveTerm
@@ -79,9 +79,7 @@ def mahalanobis_cost(
     temperature = None if temperature is None else numpy_for(temperature).asarray(temperature, dtype)
     fixed = primal((source, target, method))
     constants = primal((motion, temperature, matches))
-    xp = numpy_for(constants[2])
-    indices = xp.where(xp.asarray(matches.valid), xp.asarray(matches.indices), -1)
-    indices = indices.reshape(-1, indices.shape[-1]).T
+    indices = Matches.given(constants[2]).indices.T
     if is_concrete(fixed, constants):
         method = with_unset_from(method, fixed[2].resolve(*fixed[:2]))
         terms, soft = method.terms(fixed[0], fixed[1], robust, False), temperature is not None
