@@ -113,8 +113,8 @@ def _nearest(
         squares = _squares(_at(queries, np.s_[:, None, None]), _at(targets, runs)).reshape(rows.shape)
         first = _smallest(squares, num_candidates)
         square, row = (jnp.take_along_axis(table, first, axis=1) for table in (squares, rows))
-        found = jnp.where(jnp.isfinite(square), row, -1).astype(jnp.int32)
-        return jnp.pad(found, [(0, 0), (0, num_candidates - found.shape[1])], constant_values=-1).T
+        row = jnp.where(jnp.isfinite(square), row, -1).astype(jnp.int32)
+        return jnp.pad(row, [(0, 0), (0, num_candidates - row.shape[1])], constant_values=-1).T
 
     count = source.valid.size
     block = max(1, _STORED // max(num_runs, num_candidates * _RUN * len(targets)))
