@@ -35,7 +35,6 @@ class DeferredRows:
 
     Args:
         compute: as of `RowsOnDemand`.
-        shape: of the array.
         anew: makes the same object for pickles, so that a worker computes it; None: pickles hold the whole array.
     """
 

@@ -15,13 +15,13 @@ Parameters = ParamSpec("Parameters")
 
 def default_devices() -> list[jax.Device]:
     """JAX's default device if one is chosen, else all local devices of its default platform."""
-    chosen = jax.default_device.value
-    return [chosen] if isinstance(chosen, jax.Device) else jax.local_devices(backend=chosen)
+    default = jax.default_device.value
+    return [default] if isinstance(default, jax.Device) else jax.local_devices(backend=default)
 
 
 def on_accelerator() -> bool:
-    chosen = jax.default_device.value
-    return getattr(chosen, "platform", chosen or jax.default_backend()) != "cpu"
+    default = jax.default_device.value
+    return getattr(default, "platform", default or jax.default_backend()) != "cpu"
 
 
 def on_cpu() -> contextlib.AbstractContextManager[Any]:

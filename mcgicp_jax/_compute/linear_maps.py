@@ -42,7 +42,7 @@ class KnownJacobian(AbstractLinearMap):
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         blocks = [self._blocks[i] for i in moving]
         pairs = zip(tangents, blocks, strict=True)
-        return [sum(each.reshape(len(each), -1) @ block.reshape(len(block), -1).T for each, block in pairs)]
+        return [sum(slope.reshape(len(slope), -1) @ block.reshape(len(block), -1).T for slope, block in pairs)]
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         return [np.tensordot(cotangents[0], self._blocks[i], 1) for i in moving]
@@ -64,12 +64,12 @@ class SideBySide(AbstractLinearMap):
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         rest = iter(tangents)
         parts = zip(self._maps, self._moving(moving), strict=True)
-        values = side_by_side([partial(each.jvp, [next(rest) for _ in own], own) for each, own in parts])
+        values = side_by_side([partial(linear.jvp, [next(rest) for _ in inputs], inputs) for linear, inputs in parts])
         return [value for (value,) in values]
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         parts = zip(self._maps, cotangents, self._moving(moving), strict=True)
-        results = side_by_side([partial(each.vjp, [cotangent], own) for each, cotangent, own in parts])
+        results = side_by_side([partial(linear.vjp, [cotangent], inputs) for linear, cotangent, inputs in parts])
         return list(itertools.chain.from_iterable(results))
 
 
@@ -95,8 +95,8 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
     @with_settings_of_package
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
         # An outer differentiation, even by other inputs, would see constants.
-        for each in inputs:
-            once(each)
+        for array in inputs:
+            once(array)
         outputs = [jnp.asarray(value) for value in values]
         moving = tuple(i for i, tangent in enumerate(tangents) if not is_symbolic_zero(tangent))
         if not moving:
@@ -131,17 +131,17 @@ class RowAverage(AbstractLinearMap):
         self._rows, self._weights, self._size = rows, counted / counts[groups], sizes[0]
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        (each,) = tangents
-        shape = each.shape[2:]
-        flat = each.reshape(*each.shape[:2], math.prod(shape))[:, self._rows]
+        (tangent,) = tangents
+        shape = tangent.shape[2:]
+        flat = tangent.reshape(*tangent.shape[:2], math.prod(shape))[:, self._rows]
         size = self._sum.shape[0]
         return [np.stack([(self._sum @ (self._weights * rows)).reshape(size, *shape) for rows in flat])]
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        (each,) = cotangents
-        shape = each.shape[2:]
-        by_rows = np.zeros((len(each), self._size, *shape), each.dtype)
-        for rows, by in zip(by_rows, each.reshape(*each.shape[:2], math.prod(shape)), strict=True):
+        (cotangent,) = cotangents
+        shape = cotangent.shape[2:]
+        by_rows = np.zeros((len(cotangent), self._size, *shape), cotangent.dtype)
+        for rows, by in zip(by_rows, cotangent.reshape(*cotangent.shape[:2], math.prod(shape)), strict=True):
             rows[self._rows] = (self._weights * (self._sum.T @ by)).reshape(len(self._rows), *shape)
         return [by_rows]
 
@@ -157,8 +157,8 @@ def averaged(values: Float[AnyArray, "N D"], groups: Int[np.ndarray, "N"]) -> Fl
         return sums / np.maximum(counts, 1)[:, None].astype(values.dtype)
     average = RowAverage(rows, groups, np.ones((len(rows), 1)), (len(fixed), len(counts)))
     (mean,) = average.jvp([np.asarray(fixed)[None]], (0,))
-    found = mean[0].astype(fixed.dtype)
-    return found if is_concrete(values) else with_derivative([found], average, [values])[0]
+    mean = mean[0].astype(fixed.dtype)
+    return mean if is_concrete(values) else with_derivative([mean], average, [values])[0]
 
 
 def is_symbolic_zero(tangent: object) -> bool:
@@ -189,12 +189,12 @@ _linear.multiple_results = True
 @with_settings_of_package
 def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> list[Any]:
     count = math.prod(batch)
-    arrays = [np.asarray(each).reshape((count, *aval.shape)) for each, aval in zip(operands, inputs, strict=True)]
+    arrays = [np.asarray(array).reshape((count, *aval.shape)) for array, aval in zip(operands, inputs, strict=True)]
     # Inside differentiation JAX compiles programs separately: `function` would compile its own here and in its threads.
     results = in_new_thread(partial(function, arrays))
     return [
-        jax.device_put(np.asarray(each, aval.dtype).reshape((*batch, *aval.shape)))
-        for each, aval in zip(results, outputs, strict=True)
+        jax.device_put(np.asarray(result, aval.dtype).reshape((*batch, *aval.shape)))
+        for result, aval in zip(results, outputs, strict=True)
     ]
 
 
@@ -211,10 +211,10 @@ def _transposed(
 
 
 def _batched(operands: Any, axes: Any, *, batch: Any, **parameters: Any) -> Any:
-    (size,) = {each.shape[axis] for each, axis in zip(operands, axes, strict=True) if axis is not None}
+    (size,) = {array.shape[axis] for array, axis in zip(operands, axes, strict=True) if axis is not None}
     first = [
-        jnp.broadcast_to(each, (size, *each.shape)) if axis is None else jnp.moveaxis(each, axis, 0)
-        for each, axis in zip(operands, axes, strict=True)
+        jnp.broadcast_to(array, (size, *array.shape)) if axis is None else jnp.moveaxis(array, axis, 0)
+        for array, axis in zip(operands, axes, strict=True)
     ]
     results = _linear.bind(*first, batch=(size, *batch), **parameters)
     return results, [0] * len(results)
@@ -275,7 +275,7 @@ def _refused(*_: Any, message: str, **__: Any) -> Any:
 
 
 def _unknown_batched(operands: Any, axes: Any, *, aval: Any, message: str) -> Any:
-    (size,) = {each.shape[axis] for each, axis in zip(operands, axes, strict=True) if axis is not None}
+    (size,) = {array.shape[axis] for array, axis in zip(operands, axes, strict=True) if axis is not None}
     return _unknown.bind(*operands, aval=aval.update(shape=(size, *aval.shape)), message=message), 0
 
 

@@ -51,9 +51,8 @@ _QUICK: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
 def quickly_compiled(function: Callable[..., Result], *, level: int | None = None) -> Callable[..., Result]:
     """`jax.jit` of a function that is called outside of other transformations; it runs on the CPU.
 
-    Args:
-        level: of LLVM's optimizations, for programs of a few small matrices: without (0), they compile in half the
-            time, and with few (1), they also run as fast as with all.
+    `level`: of LLVM's optimizations, for programs of a few small matrices: without (0), they compile in half the time,
+    and with few (1), they also run as fast as with all.
     """
     options = _QUICK if level is None else {**_QUICK, "xla_backend_optimization_level": level}
 
@@ -102,9 +101,10 @@ def call_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any
     leaves, structure = jax.tree.flatten(arguments)
     pieces = [_pieces(leaf) for leaf in leaves]
 
-    def joined(*given: list[Any]) -> Any:
-        whole = [np.concatenate([np.asarray(piece) for piece in each]) if len(each) > 1 else each[0] for each in given]
-        return function(*jax.tree.unflatten(structure, [np.asarray(each) for each in whole]))
+    def joined(*split: list[Any]) -> Any:
+        arrays = [list(map(np.asarray, parts)) for parts in split]
+        whole = [np.concatenate(parts) if len(parts) > 1 else parts[0] for parts in arrays]
+        return function(*jax.tree.unflatten(structure, whole))
 
     return jax.pure_callback(joined, shapes, *pieces, vmap_method="sequential")
 

@@ -21,7 +21,6 @@ class Layout(NamedTuple):
     """How a tree of arrays lies in one.
 
     Attributes:
-        structure: of the tree.
         shapes: of each array, without the axes that they share.
         dtypes: of each array; None if it is that of the table.
     """
