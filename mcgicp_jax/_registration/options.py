@@ -120,17 +120,17 @@ class GivenOptions(TypedDict, total=False):
     soft_matches: bool | None
 
 
-def options_of(function: Callable[..., Any], given: Any) -> Options:
+def options_of(function: Callable[..., Any], options: Any) -> Options:
     """The options of `register` given to another function; raises `TypeError` for a name that neither function has."""
     parameters = inspect.signature(function).parameters.values()
     named = [parameter.name for parameter in parameters if parameter.kind is not inspect.Parameter.VAR_KEYWORD]
     names = list(dict.fromkeys([*GivenOptions.__annotations__, *named]))
-    for name in given.keys() - names:
+    for name in options.keys() - names:
         close = difflib.get_close_matches(name, names)
         hint = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"
         hint = "average the clouds by preprocess(cloud, voxel_size=...)" if name == "voxel_size" else hint
         raise TypeError(f"{function.__name__}: got an unexpected argument {name!r}; {hint}")
-    return Options(**given)
+    return Options(**options)
 
 
 def check_method(method: AbstractMethod) -> None:

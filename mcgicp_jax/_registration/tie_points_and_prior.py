@@ -55,8 +55,8 @@ def checked_measurements(
     return ties, None if prior is None else _centred_prior(prior, source, target)
 
 
-def _centred_tie_points(given: GivenTiePoints, source: PointCloud, target: PointCloud) -> TiePoints:
-    points, targets, covariances = _parts("tie_points", given, "(source_points, target_points, covariances)", 3)
+def _centred_tie_points(tie_points: GivenTiePoints, source: PointCloud, target: PointCloud) -> TiePoints:
+    points, targets, covariances = _parts("tie_points", tie_points, "(source_points, target_points, covariances)", 3)
     count = np.shape(points)[0] if np.ndim(points) else 0
     points = _numbers("tie_points: source_points", points, (count, 3))
     targets = _numbers("tie_points: target_points", targets, (count, 3))
@@ -68,8 +68,8 @@ def _centred_tie_points(given: GivenTiePoints, source: PointCloud, target: Point
     return TiePoints(points - source.origin, targets - target.origin, covariances)
 
 
-def _centred_prior(given: GivenPrior, source: PointCloud, target: PointCloud) -> Prior:
-    pose, covariance = _parts("prior", given, "(pose, covariance)", 2)
+def _centred_prior(prior: GivenPrior, source: PointCloud, target: PointCloud) -> Prior:
+    pose, covariance = _parts("prior", prior, "(pose, covariance)", 2)
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     if is_concrete(covariance, source.points, source.origin):
@@ -201,20 +201,20 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
     return jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
 
 
-def _parts(name: str, given: Any, form: str, count: int) -> Any:
-    if not isinstance(given, tuple | list) or len(given) != count:
-        got = f"{len(given)} items" if isinstance(given, tuple | list) else type(given).__name__
+def _parts(name: str, value: Any, form: str, count: int) -> Any:
+    if not isinstance(value, tuple | list) or len(value) != count:
+        got = f"{len(value)} items" if isinstance(value, tuple | list) else type(value).__name__
         raise ValueError(f"{name}: expected {form}, got {got}")
-    return given
+    return value
 
 
-def _numbers(name: str, given: Any, shape: tuple[int, ...]) -> Any:
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Any:
     """The array, in float64 if it is concrete."""
-    concrete = is_concrete(given)
+    concrete = is_concrete(value)
     try:
-        array = np.asarray(given, np.float64) if concrete else jnp.asarray(given)
+        array = np.asarray(value, np.float64) if concrete else jnp.asarray(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: expected numbers of shape {shape}, got {type(given).__name__}") from error
+        raise ValueError(f"{name}: expected numbers of shape {shape}, got {type(value).__name__}") from error
     if array.shape != shape:
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
     if concrete and not np.isfinite(array).all():
