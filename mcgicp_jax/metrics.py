@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.messages import check_integer, check_positive
 from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
 
 __all__ = ["ate", "kitti_errors", "pose_error", "rpe"]
@@ -129,9 +130,12 @@ def kitti_errors(
         Translation error in percent of the segment length, and rotation error in degrees per metre.
 
     Raises:
-        ValueError: if the trajectories are empty or differ in length, a pose is no rigid motion, or the path is no
-            longer than the shortest segment.
+        ValueError: if the trajectories are empty or differ in length, a pose is no rigid motion, a length or the step
+            is not positive, or the path is no longer than the shortest segment.
     """
+    check_integer("step", step, 1)
+    for segment in lengths:
+        check_positive("lengths", segment, "positive numbers")
     estimated, true = _trajectories(poses, true_poses)
     along = np.concatenate([[0], np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).cumsum()])
     first, length = np.meshgrid(np.arange(0, len(true), step), np.asarray(lengths, float))

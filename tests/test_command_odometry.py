@@ -66,6 +66,8 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
     for args, message in (
         (["kitti", str(tmp_path)], str(tmp_path)),
         (["kitti"], "mcgicp odometry kitti PATH"),
+        (["box-room", str(alone)], "PATH: expected none after box-room"),
+        ([str(alone), str(alone)], "PATH: expected none after"),
         (["kitti", str(tmp_path), "--map", str(tmp_path / "velodyne" / "000000.bin")], "000000.bin: "),
         (["tum", str(tmp_path)], "depth.txt: "),
         (["7-scenes", str(alone)], "2 frames, got 1"),
@@ -157,6 +159,15 @@ def test_frames_before_an_invalid_one_are_written(tmp_path, capsys, monkeypatch,
     text, errors = capsys.readouterr()
     assert reason in errors and "3 of 4 frames" in errors
     assert "pairs:     2 of 2 converged" in text and len(io.read_poses(poses)) == 3 and len(io.read(map)) > 1000
+
+
+def test_a_second_frame_that_cannot_be_read_is_named(tmp_path, capsys):
+    """Also where defaults depend on two clouds."""
+    (frame,), poses = datasets.box_room(1, points_per_frame=1500), tmp_path / "poses.txt"
+    io.write(tmp_path / "0.npz", frame.cloud)
+    (tmp_path / "1.npz").write_bytes(b"nothing")
+    assert main(["odometry", str(tmp_path), "--method", "color-icp", "--output", str(poses)]) == 1
+    assert "mcgicp: frame 1: " in capsys.readouterr().err and len(io.read_poses(poses)) == 1
 
 
 @pytest.mark.slow

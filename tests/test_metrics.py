@@ -65,6 +65,8 @@ def test_wrong_arguments_are_refused_by_name():
         ("poses[0]", "", lambda: ate([2 * np.eye(4)], here)),
         ("delta", 2, lambda: rpe(here * 2, here * 2, 2)),
         ("lengths", 0.0, lambda: kitti_errors(here * 2, here * 2)),
+        ("lengths", 0.0, lambda: kitti_errors(here * 2, here * 2, lengths=[0.0])),
+        ("step", 0, lambda: kitti_errors(here * 2, here * 2, step=0)),
         ("alignment", "best", lambda: ate(here, here, alignment="best")),
     ):
         refused(call, named, shown)

@@ -131,7 +131,7 @@ def odometry(
     print(f"points:    {choices.voxels}")
 
     def source_and_target() -> tuple[mcg.PointCloud, mcg.PointCloud]:
-        return choices.preprocess(frames[1].cloud), choices.preprocess(first.cloud)
+        return choices.preprocess(start[-1]), choices.preprocess(first.cloud)
 
     resolved_method = choices.method(name, source_and_target)
     options = choices.arguments(name, source_and_target)
@@ -175,6 +175,8 @@ def _open(
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
+    if path is not None and not (isinstance(dataset, str) and not DATASETS[dataset].simulated):
+        raise ValueError(f"PATH: expected none after {dataset}, got {path}")
     if isinstance(dataset, str) and DATASETS[dataset].simulated:
         simulate: Any = DATASETS[dataset].frames
         if deskew and "spin" in inspect.signature(simulate).parameters:

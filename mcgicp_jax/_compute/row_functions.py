@@ -197,7 +197,7 @@ class RowFunction:
             return places, indices, *jax.tree.map(np.asarray, program(self._numbers, packs, indices, of_block))
 
         slopes: dict[int, np.ndarray] = {}
-        scratch = {j: np.empty(entry.table.size, np.int32) for j, entry in enumerate(self._inputs)}
+        scratch: dict[int, np.ndarray] = {}
         for places, indices, by_numbers, by_rows in gathered.in_order(run):
             for i, by in zip(numbers, by_numbers, strict=True):
                 key = id(self._leaves[i])
@@ -206,7 +206,8 @@ class RowFunction:
             for j, by in enumerate(by_rows):
                 if columns[j]:
                     if j not in slopes:
-                        slopes[j] = np.zeros((self._inputs[j].table.size, count, by.shape[-1]), by.dtype)
+                        size = self._inputs[j].table.size
+                        slopes[j], scratch[j] = np.zeros((size, count, by.shape[-1]), by.dtype), np.empty(size, int)
                     _add_rows(slopes[j], indices[j][live], by[(*live, slice(None), slice(None))], scratch[j])
         for j, slope in slopes.items():
             self._inputs[j].table.vjp(slope, moving, into, gathered.used(j))

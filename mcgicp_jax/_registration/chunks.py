@@ -175,9 +175,9 @@ class _Group(Generic[Key]):
         try:
             waits = bool(self.waiting or (self._slow and not self._dispatched))
             if waits:
-                self._dispatch()
+                ended += self._dispatch()
             if not waits or len(self._dispatched) >= _DISPATCHED:
-                ended = self._fetched()
+                ended += self._fetched()
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
@@ -191,14 +191,10 @@ class _Group(Generic[Key]):
             self._per_device //= 2
             self.waiting.extendleft(reversed(begun))
             self._dispatched.clear()
-        except ValueError as error:
-            # While the program is traced: no pair of these shapes can be registered.
-            pairs, *_ = self._dispatched.pop()
-            ended = [Refused(key, error) for key, _ in pairs]
         yield from ended
 
-    def _dispatch(self) -> None:
-        """Start the program for the next pairs; copies of the last one fill up the chunk."""
+    def _dispatch(self) -> list[Refused[Key]]:
+        """Start the program for the next pairs, or refuse them; copies of the last one fill up the chunk."""
         if not self._per_device:
             most = self._largest()
             wanted = -(-len(self.waiting) // self._mesh.size)
@@ -215,7 +211,13 @@ class _Group(Generic[Key]):
         sharding = NamedSharding(self._mesh, PartitionSpec("pairs"))
         chunk = jax.device_put(jax.tree.map(lambda *leaves: np.stack(leaves), *filled), sharding)
         limit = np.int32(self._first_updates if first else self._all_updates)
-        self._dispatched[-1] = pairs, first, self._program(chunk, limit)
+        try:
+            self._dispatched[-1] = pairs, first, self._program(chunk, limit)
+        except ValueError as error:
+            # While the program is traced: no pair of these shapes can be registered.
+            self._dispatched.pop()
+            return [Refused(key, error) for key, _ in pairs]
+        return []
 
     def _fetched(self) -> list[Any]:
         """The results of the oldest chunk; those of its pairs that have not ended join the slow ones."""

@@ -101,7 +101,11 @@ def is_cloud(path: Path) -> bool:
     if file_format is None:
         return False
     with open(path, "rb") as file:
-        return file_format.is_cloud(file)
+        try:
+            return file_format.is_cloud(file)
+        except Exception:
+            # Damaged: its reader says so, and names it.
+            return True
 
 
 def read(path: str | os.PathLike[str], *, columns: int | None = None) -> PointCloud:
