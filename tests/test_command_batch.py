@@ -168,6 +168,18 @@ def test_a_list_that_makes_no_sense(tmp_path, capsys):
         assert message in errors and errors.count("\n") == 1
 
 
+def test_warnings_name_the_files_of_their_pair(folder, tmp_path, capsys):
+    cloud = io.read(folder / "scan_1.ply")
+    points = np.array(cloud.points)
+    points[3] = np.nan
+    io.write(tmp_path / "broken.npz", cloud.replace(points=points))
+    shutil.copy2(folder / "scan_0.ply", tmp_path)
+    rows = [["scan_0.ply", "scan_0.ply"], ["broken.npz", "scan_0.ply"]]
+    pairs = write_pairs(tmp_path / "pairs.csv", rows)
+    assert main(["batch", pairs, "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 0
+    assert "broken.npz scan_0.ply: source: left out 1 of 1000" in capsys.readouterr().err
+
+
 def test_a_list_from_a_spreadsheet(folder, tmp_path):
     """With a byte order mark, and blanks after the commas."""
     pairs = folder / "marked.csv"

@@ -6,6 +6,7 @@ import collections
 import contextlib
 import csv
 import itertools
+import re
 import signal
 import sys
 import threading
@@ -69,7 +70,8 @@ def batch(
     poses. In a folder, each cloud is registered to the one before it in order of name; files that are no clouds are
     left out. To resume after Ctrl-C, or to add pairs, run the same command again: it skips pairs that are in the table,
     except those that could not be registered, for instance since a file is missing. For other options, write another
-    table. The exit code is 0 only if all pairs converged.
+    table. Channels, and defaults that depend on clouds, are those of the first pair that can be read. The exit code is
+    0 only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.
@@ -204,9 +206,9 @@ def _register_missing(
         def note_reason(message: Warning | str, *rest: Any, **options: Any) -> None:
             if isinstance(message, mcg.PairWarning) and message.index is not None:
                 reasons[message.index] = message.reason
-                message = f"{' '.join(keys[message.index][:2])}: {message.reason}"
+            text = re.sub(r"^pair (\d+)(?=:)", lambda number: " ".join(keys[int(number[1])][:2]), str(message))
             with bar.external_write_mode(file=sys.stderr):
-                show(message, *rest, **options)
+                show(text, *rest, **options)
 
         warnings.simplefilter("always", mcg.PairWarning)
         warnings.showwarning = note_reason
