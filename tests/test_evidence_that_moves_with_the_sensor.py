@@ -153,14 +153,22 @@ def test_from_afar_range_and_angles_are_coordinates():
 
 
 def test_gradients_by_channels_that_are_left_out_are_zero():
-    pair = seen(CORRIDOR, 0, MOVING_CHANNELS["range"], count=1000)
-    source, target = (mcg.preprocess(cloud, None) for cloud in (pair.source, pair.target))
+    """Also by those that Λ compares with another one."""
+    pair, rng = seen(CORRIDOR, 0, MOVING_CHANNELS["range"], count=1000), np.random.default_rng(0)
+    source, target = (
+        mcg.preprocess(mcg.PointCloud(cloud.points, np.column_stack([cloud.channels, rng.random(1000)])), None)
+        for cloud in (pair.source, pair.target)
+    )
+    method = mcg.MultiChannelGICP(np.array([[0.05, 0.01], [0.01, 0.08]]), np.array([0.3, 0.2]))
 
     def along(channels):
-        return mcg.register(source.replace(channels=channels), target, METHOD).T_target_source.translation()[0]
+        return mcg.register(source.replace(channels=channels), target, method).T_target_source.translation()[0]
 
     with pytest.warns(UserWarning, match="is left out"):
-        assert not np.any(jax.grad(along)(jnp.asarray(source.channels)))
+        gradient = jax.grad(along)(jnp.asarray(source.channels))
+        jacobian = mcg.register(source, target, method).jacobian("source", "channels")
+    for derivative in (gradient, jacobian):
+        np.testing.assert_array_equal(np.any(derivative.reshape(-1, 2), axis=0), [False, True])
 
 
 def test_a_pose_that_smooth_channels_hold_has_a_derivative_by_them():

@@ -408,6 +408,23 @@ def test_gains_of_equalized_channels_are_constants_of_which_gradients_warn(soft_
     np.testing.assert_allclose(by_worker, gradient(channels), rtol=1e-6, atol=1e-9)
 
 
+def test_gradients_of_equalized_channels_do_not_depend_on_what_else_is_differentiated(clouds):
+    """Outside `jit`, what is not differentiated is equalised, too."""
+    clouds = clouds[0].replace(channels=2 * clouds[0].channels - 0.7), clouds[1]
+    inputs = inputs_of(*clouds, METHOD, None)
+
+    def loss(inputs):
+        options = {"equalize_channels": True, "soft_matches": None}
+        return posed(clouds_with(inputs, *clouds), inputs["method"], **options)
+
+    with pytest.warns(UserWarning, match="equalize_channels: gain and offset"):
+        together = jax.grad(loss)(inputs)
+    for name in ("source points", "target points", "method"):
+        alone = jax.grad(lambda value, name=name: loss(inputs | {name: value}))(inputs[name])
+        for one, other in zip(*map(jax.tree.leaves, (alone, together[name])), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+
+
 def test_preprocessing_has_a_derivative():
     """Raw points, with rows to drop and missing channels, through the voxels."""
     points, channels = room_corner(900, noise=0.02, seed=1)

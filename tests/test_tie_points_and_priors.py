@@ -290,6 +290,13 @@ def test_derivatives_of_a_batch_with_priors(corner):
     with ThreadPoolExecutor(1) as executor:
         by_points = jax.grad(lambda points: loss((points, given[1]), executor))(given[0])
         refused(lambda: jax.grad(partial(loss, executor=executor))(given), "priors[0]")
+
+        def by_origin(origin):
+            options = {"priors": [(truth, given[1])], "executor": executor} | OPTIONS
+            moved = source.replace(origin=origin)
+            return weigh(mcg.register_batch([moved], [target], mcg.GICP(), **options)[0].matrix)
+
+        refused(lambda: jax.grad(by_origin)(jnp.zeros(3)), "priors[0]", "concrete origins")
     np.testing.assert_allclose(by_points, expected[0], rtol=1e-3, atol=1e-5 * np.abs(expected[0]).max())
 
 

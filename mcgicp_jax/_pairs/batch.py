@@ -93,7 +93,7 @@ def register_as_completed(
         init: initial T_target_source: one for all pairs, or an iterable with one per pair. None is the pose of the
             prior, if there is one, or the identity, and "global" the pose found by `global_pose`.
         priors: one per pair: a measurement of T_target_source, in the form of the `prior` of `register`, or None. Pairs
-            with priors run on the CPU. With an `executor`, the poses have no derivatives by them.
+            with priors run on the CPU. With an `executor`, the poses have no derivatives by them, nor by origins then.
         voxel_size, num_neighbors: as in `preprocess`, for raw clouds, which the workers preprocess. "auto": one size
             for both clouds of a pair; that of a single cloud for all pairs, if it has any, applies to all.
         executor: None: threads, one per core, until the time that processes would save on the other pairs is 1.5 times

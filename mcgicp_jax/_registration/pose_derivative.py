@@ -220,6 +220,9 @@ def jacobian(
     if array is None:
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
     (by_array,) = parameters_by(inputs, inputs, executor, loop, [array])
+    if field == "channels":
+        # Those that move with the sensor were replaced by 0.
+        by_array = by_array * np.any(array, axis=0)
     pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), Motion.of(loop.state.pose.wxyz_xyz).rotation
     twist = np.zeros((6, 7))
     twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn_by_quaternion(pose[:4])
@@ -247,9 +250,10 @@ def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: 
     if is_concrete(given):
         return None
     source = given.source
-    if inputs.gains is not None and not is_concrete(source.channels):
-        gains, equalized = np.asarray(inputs.gains, source.channels.dtype), inputs.source.channels
-        (channels,) = blockwise(_equalized, gains, Input(source.channels), Input(equalized))
+    if inputs.gains is not None:
+        channels, gains = inputs.source.channels, np.asarray(inputs.gains, source.channels.dtype)
+        if not is_concrete(source.channels):
+            (channels,) = blockwise(_equalized, gains, Input(source.channels), Input(channels))
         source = source.replace_rows(channels=channels)
     method = with_unset_from(given.method, inputs.method)
     traced = given._replace(source=source, method=method, source_rows=inputs.source_rows)

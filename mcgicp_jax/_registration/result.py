@@ -240,7 +240,7 @@ class RegistrationResult(eqx.Module):
 
         Returns:
             (6, *shape of the array): of ξ = (v, ω) in T exp(ξ), metres and radians, as in `covariance`, per unit of the
-            array. 0 where the derivative of `register` is.
+            array. 0 where the derivative of `register` is, and by channels that are 0 in all rows.
 
         Raises:
             ValueError: in copies, such as the results of batches and odometry, and inside transformations.
