@@ -17,7 +17,7 @@ from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_g
 from mcgicp_jax._clouds.voxels import Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import RowAverage, primal, with_derivative
-from mcgicp_jax._compute.messages import check_integer, check_positive, warn
+from mcgicp_jax._compute.messages import check_concrete, check_integer, check_positive, warn
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._search.brute_force import default_search
@@ -229,8 +229,7 @@ def check_preprocessing(voxel_size: VoxelSize | Voxels, num_neighbors: int) -> N
 def finite_rows(cloud: PointCloud | Values, measured: Bool[np.ndarray, "N"] | None = None) -> PointCloud:
     """A raw cloud without padding, non-finite rows and placeholders; warns of the latter two. `measured`: if known."""
     cloud = as_cloud("cloud", cloud)
-    if not is_concrete(cloud):
-        raise ValueError("cloud: expected concrete arrays, got tracers; call this outside of jit and vmap")
+    check_concrete("cloud", cloud)
     if cloud.points.ndim != 2:
         raise ValueError(f"cloud: expected a single cloud, got a batch of shape {cloud.points.shape}")
     measured = None if measured is None else measured[np.asarray(cloud.valid)]
