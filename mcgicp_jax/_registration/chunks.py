@@ -193,7 +193,7 @@ class _Group(Generic[Key]):
             self._dispatched.clear()
         yield from ended
 
-    def _dispatch(self) -> list[Refused[Key]]:
+    def _dispatch(self) -> list[Any]:
         """Start the program for the next pairs, or refuse them; copies of the last one fill up the chunk."""
         if not self._per_device:
             most = self._largest()
