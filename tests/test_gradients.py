@@ -588,6 +588,17 @@ def test_jacobian_is_that_of_small_motions(clouds):
     refused(lambda: result.jacobian("source", "covariances"), "covariances")
 
 
+def test_jacobian_is_by_the_named_cloud_where_both_share_an_array(clouds):
+    source, target = clouds
+    shared, copied = (source.replace(channels=channels) for channels in (target.channels, np.array(target.channels)))
+    assert shared.channels is target.channels and copied.channels is not target.channels
+    results = [mcg.register(cloud, target, METHOD, **HARD) for cloud in (shared, copied)]
+    for side in ("source", "target"):
+        one, other = (result.jacobian(side, "channels") for result in results)
+        np.testing.assert_array_equal(one, other)
+        assert np.any(one)
+
+
 def test_nested_differentiation_is_refused(clouds):
     """By other inputs, too: the inner value would be a constant to the outer differentiation."""
     source, target = clouds

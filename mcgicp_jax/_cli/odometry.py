@@ -175,7 +175,7 @@ def _open(
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
-    if path is not None and not (isinstance(dataset, str) and not DATASETS[dataset].simulated):
+    if path is not None and dataset not in _RECORDED:
         raise ValueError(f"PATH: expected none after {dataset}, got {path}")
     if isinstance(dataset, str) and DATASETS[dataset].simulated:
         simulate: Any = DATASETS[dataset].frames

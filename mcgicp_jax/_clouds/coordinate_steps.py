@@ -86,11 +86,13 @@ def _shows_rounding(cloud: PointCloud, coarse: Bool[AnyArray, "3"], steps: Float
     exists = (neighbors >= 0) & counts[:, None]
     offsets = points[neighbors] - points[rows][:, None]
     same = exists & ((xp.abs(offsets) < _SAME * steps) | ~coarse).all(axis=2)
-    # Copies of a point that differ on the coarse axis alone follow one another, sorted by the other two axes first.
+    copied = (exists & ((offsets == 0) | coarse).all(axis=2) & (offsets != 0).any(axis=2)).any(axis=1)
+    # Copies that differ on one axis may lie farther apart: sorted by the other two axes first, they follow one another.
     fine = xp.where(coarse, 0, points)
     order = xp.lexsort((xp.where(coarse, points, 0).sum(axis=1), *fine.T))
     copies = (xp.diff(fine[order], axis=0) == 0).all(axis=1) & (xp.diff(points[order], axis=0) != 0).any(axis=1)
-    copied = (xp.append(copies, False) | xp.append(False, copies))[xp.argsort(order)][rows] & (xp.sum(coarse) == 1)
+    far = (xp.append(copies, False) | xp.append(False, copies))[xp.argsort(order)][rows]
+    copied = copied | (far & (xp.sum(coarse) == 1))
     x, y, z = xp.where(same[..., None] & ~coarse, offsets, 0).transpose(2, 0, 1)
     mostly = 2 * xp.sum(same, axis=1) > xp.sum(exists, axis=1)
     # Squares of coordinates up to 1e30 overflow; such clouds are no measurements.

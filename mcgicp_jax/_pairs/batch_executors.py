@@ -86,14 +86,14 @@ def run(
 def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor) -> list[RegistrationResult]:
     """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives."""
     outcomes = {}
-    for given in pairs:
-        if not is_concrete(given.prior):
-            raise ValueError(f"priors[{given.index}]: expected concrete arrays with an executor, got tracers")
-        outcomes[given.index] = job.prepare(given)
+    for pair in pairs:
+        if not is_concrete(pair.prior):
+            raise ValueError(f"priors[{pair.index}]: expected concrete arrays with an executor, got tracers")
+        outcomes[pair.index] = job.prepare(pair)
     ready = {index: pair for index, pair in outcomes.items() if isinstance(pair, PreparedPair)}
-    for index, pair in ready.items():
-        # Of a prior, whose pose is in the user's frames, the equation of the centred pose depends on them.
-        if pair.prior is not None and not is_concrete(pair.inputs.source.origin, pair.inputs.target.origin):
+    for index, prepared in ready.items():
+        # With a prior, whose pose is in the user's frames, the equation of the centred pose depends on the origins.
+        if prepared.prior is not None and not is_concrete(*(cloud.origin for cloud in prepared.inputs[:2])):
             raise ValueError(f"priors[{index}]: expected clouds with concrete origins with an executor, got tracers")
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
     sent = (Pair(pair.index, *pair.inputs.values()[:2], pair.init, pair.prior, pair.traced) for pair in ready.values())

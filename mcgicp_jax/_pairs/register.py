@@ -76,7 +76,8 @@ def register(
     these are several candidates per point whose weights have derivatives: see `soft_matches`.
     Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
     UNVERIFIED poses, and those after MAX_ITERATIONS, have a derivative as if they had converged. After other failures
-    it is 0, never NaN, and also where Newton's method finds no root of soft matches: for a tenth of pairs of 60 points.
+    it is 0, never NaN. It is 0, too, if Newton's method finds no root of the soft matches, as for some pairs of 60
+    points whose channels are noise.
     Outside `jit`, value and gradient take two to five registrations, for clouds of any size; inside, each size compiles
     for some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
 

@@ -216,10 +216,14 @@ def jacobian(
     inputs: Inputs, executor: HostExecutor, loop: LoopResult, cloud: str, field: str
 ) -> Float[np.ndarray, "6 ..."]:
     """The derivative of the final pose by an array of a cloud, see `RegistrationResult.jacobian`."""
-    array = getattr(getattr(inputs, cloud), field)
+    side: Any = getattr(inputs, cloud)
+    array = getattr(side, field)
     if array is None:
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
-    (by_array,) = parameters_by(inputs, inputs, executor, loop, [array])
+    # Arrays are told apart by identity, and the clouds may share this one: a view is another array.
+    array = np.asarray(array).view()
+    given = inputs._replace(**{cloud: side.replace_rows(**{field: array})})
+    (by_array,) = parameters_by(given, inputs, executor, loop, [array])
     if field == "channels":
         # Those that move with the sensor were replaced by 0.
         by_array = by_array * np.any(array, axis=0)
@@ -233,32 +237,34 @@ def parameters_by(
     given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult, arrays: Sequence[Any]
 ) -> list[Float[np.ndarray, "7 ..."]]:
     """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of the final pose by concrete arrays among the leaves of
-    `given`, of which `inputs` are those of the registration."""
-    channels, gains = given.source.channels, inputs.gains
-    method = with_unset_from(given.method, inputs.method)
-    registered = [inputs.source.channels if array is channels else array for array in arrays]
-    derivative = PoseDerivative(inputs._replace(method=method), inputs, executor, loop, registered)
+    `given`; `inputs` are the same as registered."""
+    channels, gains, equalized = given.source.channels, inputs.gains, None
+    registered = list(arrays)
+    if gains is not None:
+        equalized = np.asarray(inputs.source.channels).view()
+        registered = [equalized if array is channels else array for array in arrays]
+    derivative = PoseDerivative(_as_registered(given, inputs, equalized), inputs, executor, loop, registered)
     slopes = derivative.vjp([np.eye(7)], tuple(range(len(arrays))))
-    return [
-        slope if gains is None or array is not channels else slope * gains
-        for slope, array in zip(slopes, arrays, strict=True)
-    ]
+    return [slope * gains if moved is equalized else slope for slope, moved in zip(slopes, registered, strict=True)]
 
 
 def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult) -> PoseDerivative | None:
     """The derivative of the final pose by the traced arrays on which it depends; origins: see `pose_in_user_frame`."""
     if is_concrete(given):
         return None
-    source = given.source
-    if inputs.gains is not None:
-        channels, gains = inputs.source.channels, np.asarray(inputs.gains, source.channels.dtype)
-        if not is_concrete(source.channels):
-            (channels,) = blockwise(_equalized, gains, Input(source.channels), Input(channels))
-        source = source.replace_rows(channels=channels)
-    method = with_unset_from(given.method, inputs.method)
-    traced = given._replace(source=source, method=method, source_rows=inputs.source_rows)
-    derivative = PoseDerivative(traced, inputs, executor, loop)
+    channels = None if inputs.gains is None else inputs.source.channels
+    if channels is not None and not is_concrete(given.source.channels):
+        gains = np.asarray(inputs.gains, channels.dtype)
+        (channels,) = blockwise(_equalized, gains, Input(given.source.channels), Input(channels))
+    derivative = PoseDerivative(_as_registered(given, inputs, channels), inputs, executor, loop)
     return derivative if derivative.arrays else None
+
+
+def _as_registered(given: Inputs, inputs: Inputs, channels: Any = None) -> Inputs:
+    """What is given, with what the registration has chosen, and with equalised channels of the source, if any."""
+    source = given.source if channels is None else given.source.replace_rows(channels=channels)
+    method = with_unset_from(given.method, inputs.method)
+    return given._replace(source=source, method=method, source_rows=inputs.source_rows)
 
 
 def _equalized(gains: Float[Array, "C"], channels: Rows, equalized: Rows) -> tuple[Float[Array, "n C"]]:
