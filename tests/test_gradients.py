@@ -403,6 +403,10 @@ def test_gains_of_equalized_channels_are_constants_of_which_gradients_warn(soft_
         once, twice = derivative(channels), derivative(others)
         assert np.any(once)
         np.testing.assert_allclose(twice, 0.5 * once, rtol=1e-6, atol=1e-9)
+    with pytest.warns(UserWarning, match="equalize_channels: gain and offset"):
+        jax.grad(lambda channels: posed((source.replace(channels=channels), target), mcg.ColorICP(0.3), **options))(
+            channels
+        )
     with ThreadPoolExecutor(1) as worker:
         by_worker = gradient(channels, registered_by_a_worker)
     np.testing.assert_allclose(by_worker, gradient(channels), rtol=1e-6, atol=1e-9)

@@ -70,8 +70,8 @@ def batch(
     poses. In a folder, each cloud is registered to the one before it in order of name; files that are no clouds are
     left out. To resume after Ctrl-C, or to add pairs, run the same command again: it skips pairs that are in the table,
     except those that could not be registered, for instance since a file is missing. For other options, write another
-    table. Channels, and defaults that depend on clouds, are those of the first pair that can be read. The exit code is
-    0 only if all pairs converged.
+    table. Channels, and defaults that depend on clouds, are those of the first pair that can be read. The exit code
+    is 0 only if all pairs converged.
 
     Args:
         pairs: CSV file or folder.

@@ -147,23 +147,23 @@ def warn_of_estimated_parameters(
     """Warn if inputs are differentiated outside `jit` from which parameters, constant to autodiff, are estimated: from
     channels Λ, gains, and α of soft matches (α of hard ones decides the matches alone); from points and channels the
     numbers of the photometric term."""
-    if not isinstance(method, MultiChannelGICP):
-        return
     channels = source.channels, target.channels
-    if method.photometric:
+    if isinstance(method, MultiChannelGICP) and method.photometric:
         if _is_differentiated((source.points, target.points, channels)):
             warn(
                 "photometric: standard deviations, gains and offsets are estimated from the residuals, but constant in "
                 "the derivative by points and channels, which is therefore not that of the result"
             )
         return
-    if not _is_differentiated(channels):
+    if not (method.uses_channels and _is_differentiated(channels)):
         return
     if equalize_channels:
         warn(
             "equalize_channels: gain and offset are estimated from the channels, but constant in the derivative by "
             "channels, which is therefore not that of the result; equalise the channels before"
         )
+    if not isinstance(method, MultiChannelGICP):
+        return
     names = ["channel_covariance", "channel_weights"] if soft else ["channel_covariance"]
     unset = [name for name in names if getattr(method, name) is None]
     if unset:

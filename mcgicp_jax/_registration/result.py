@@ -231,12 +231,12 @@ class RegistrationResult(eqx.Module):
     def jacobian(
         self, cloud: Literal["source", "target"], field: Literal["points", "channels", "covariances"] = "points"
     ) -> Float[np.ndarray, "6 N ..."]:
-        """Derivative of the pose by an array of a preprocessed cloud, with matches and neighbours held fixed.
+        """Derivative of the pose by an array of a preprocessed cloud, as that of `register`: see there, `soft_matches`.
 
         Errors of the array with the covariance Σ cause the error J Σ Jᵀ of the pose.
 
         Args:
-            cloud, field: the array, for instance the points (N, 3) of the source.
+            cloud, field: names of the cloud and of its array, such as "source" and "points", whose shape is (N, 3).
 
         Returns:
             (6, *shape of the array): of ξ = (v, ω) in T exp(ξ), metres and radians, as in `covariance`, per unit of the
