@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import itertools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -23,6 +24,9 @@ from mcgicp_jax._compute.threads import in_new_thread, side_by_side, with_settin
 
 class AbstractLinearMap(abc.ABC):
     """The derivative of values by inputs, in NumPy. The first axis of all arrays counts the tangents or cotangents."""
+
+    # Whether compiled programs run.
+    runs_programs = False
 
     @abc.abstractmethod
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> Sequence[np.ndarray]:
@@ -50,6 +54,8 @@ class KnownJacobian(AbstractLinearMap):
 
 class SideBySide(AbstractLinearMap):
     """Several maps, each with one value and its own inputs, of which `counts` are the numbers; computed in threads."""
+
+    runs_programs = True
 
     def __init__(self, maps: Sequence[AbstractLinearMap], counts: Sequence[int]):
         self._maps, self._starts = maps, np.cumsum([0, *counts])
@@ -101,10 +107,12 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
         moving = tuple(i for i, tangent in enumerate(tangents) if not is_symbolic_zero(tangent))
         if not moving:
             return outputs, [jnp.zeros_like(value) for value in outputs]
+        # Inside differentiation JAX compiles programs separately: they would compile again here and in their threads.
+        run = in_new_thread if linear.runs_programs else operator.call
         slopes = _linear.bind(
             *(tangents[i] for i in moving),
-            function=partial(linear.jvp, moving=moving),
-            transpose=partial(linear.vjp, moving=moving),
+            function=lambda arrays: run(partial(linear.jvp, arrays, moving)),
+            transpose=lambda arrays: run(partial(linear.vjp, arrays, moving)),
             inputs=tuple(jax.typeof(inputs[i]) for i in moving),
             outputs=tuple(map(jax.typeof, outputs)),
             batch=(),
@@ -190,11 +198,9 @@ _linear.multiple_results = True
 def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any) -> list[Any]:
     count = math.prod(batch)
     arrays = [np.asarray(array).reshape((count, *aval.shape)) for array, aval in zip(operands, inputs, strict=True)]
-    # Inside differentiation JAX compiles programs separately: `function` would compile its own here and in its threads.
-    results = in_new_thread(partial(function, arrays))
     return [
         jax.device_put(np.asarray(result, aval.dtype).reshape((*batch, *aval.shape)))
-        for result, aval in zip(results, outputs, strict=True)
+        for result, aval in zip(function(arrays), outputs, strict=True)
     ]
 
 

@@ -91,8 +91,9 @@ class GivenTable:
         leaves = [self._leaves[i] for i in self.columns(moving)]
         ends = np.cumsum([math.prod(leaf.shape[1:]) for leaf in leaves])
         for leaf, part in zip(leaves, np.split(cotangents, ends[:-1], axis=-1), strict=True):
-            slope = part.swapaxes(0, 1).astype(np.float64)
-            into[id(leaf)] = into.get(id(leaf), 0) + slope.reshape(len(slope), *leaf.shape)
+            slope = part.swapaxes(0, 1).astype(np.float64, copy=False)
+            slope, before = slope.reshape(len(slope), *leaf.shape), into.get(id(leaf))
+            into[id(leaf)] = slope if before is None else before + slope
 
     def jvp(self, tangents: Slopes, rows: Any) -> np.ndarray:
         leaves = [tangents[id(self._leaves[i])] for i in self.columns(frozenset(tangents))]
@@ -196,6 +197,7 @@ class RowFunction:
                 of_block[: len(of_rows)] = of_rows
             return places, indices, *jax.tree.map(np.asarray, program(self._numbers, packs, indices, of_block))
 
+        used = {j: gathered.used(j) for j, places in enumerate(columns) if places}
         slopes: dict[int, np.ndarray] = {}
         scratch: dict[int, np.ndarray] = {}
         for places, indices, by_numbers, by_rows in gathered.in_order(run):
@@ -203,14 +205,17 @@ class RowFunction:
                 key = id(self._leaves[i])
                 into[key] = into.get(key, 0) + by.astype(np.float64)
             live = (..., slice(0, places.stop - places.start))
-            for j, by in enumerate(by_rows):
-                if columns[j]:
-                    if j not in slopes:
-                        size = self._inputs[j].table.size
-                        slopes[j], scratch[j] = np.zeros((size, count, by.shape[-1]), by.dtype), np.empty(size, int)
-                    _add_rows(slopes[j], indices[j][live], by[(*live, slice(None), slice(None))], scratch[j])
+            for j in used:
+                of_rows, by = indices[j][live], by_rows[j][(*live, slice(None), slice(None))]
+                if j not in slopes:
+                    size = self._inputs[j].table.size
+                    slopes[j], scratch[j] = np.zeros((size, count, by.shape[-1]), by.dtype), np.empty(size, int)
+                if gathered.repeats(j, used[j]):
+                    _add_rows(slopes[j], of_rows, by, scratch[j])
+                else:
+                    slopes[j][of_rows] = by
         for j, slope in slopes.items():
-            self._inputs[j].table.vjp(slope, moving, into, gathered.used(j))
+            self._inputs[j].table.vjp(slope, moving, into, used[j])
 
     def jvp(self, tangents: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
         """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of arrays. A scalar 0 if it
@@ -317,10 +322,18 @@ class _Gathered:
         for start in range(0, len(self.blocks), at_once):
             yield from side_by_side([partial(run, *block) for block in self.blocks[start : start + at_once]])
 
+    def repeats(self, j: int, used: Int[np.ndarray, "n"]) -> bool:
+        """Whether the index of input `j` has a row more than once, or −1."""
+        return self._indices[j] is not None and self._indices[j].size > used.size
+
     def used(self, j: int) -> Int[np.ndarray, "n"]:
         """The rows of the table of input `j` that are used."""
         index = self._indices[j]
-        return self._rows if index is None else np.unique(index[index >= 0])
+        if index is None:
+            return self._rows
+        used = np.zeros(len(self._packs[j].table), bool)
+        used[index[index >= 0]] = True
+        return np.flatnonzero(used)
 
 
 @with_settings_of_package
@@ -388,6 +401,8 @@ def size_of(first: Input) -> int:
 
 class _Derivative(AbstractLinearMap):
     """The derivative of the arrays that a row function returns."""
+
+    runs_programs = True
 
     def __init__(self, applied: RowFunction, total: bool, layout: Layout):
         self._applied, self._total, self._layout = applied, total, layout

@@ -12,11 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.sparse import csr_array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, is_concrete, numpy_for
-from mcgicp_jax._compute.row_functions import ComputedTable, Rows, over_both
+from mcgicp_jax._compute.row_functions import ComputedTable, GivenTable, Input, Moving, Rows, Slopes, over_both
+from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry import neighborhoods as nb
 from mcgicp_jax._local_geometry.neighborhoods import ChannelFits, Neighborhoods
@@ -157,31 +159,98 @@ def local_geometries(
             partial(geometry_table(target, with_channels).trees, rows[1], num_threads),
             partial(geometry_table(source, with_channels).trees, rows[0], num_threads),
         ]
-        (of_target,), (of_source,) = side_by_side(calls, num_threads)
-        return of_source, of_target
+        of_target, of_source = side_by_side(calls, num_threads)
+        return joined(*of_source), joined(*of_target)
     # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
     source_inputs = nb.of_rows(nb.with_near(source, with_channels), rows[0])
     target_inputs = nb.of_rows(nb.with_near(target, with_channels), rows[1])
-    (of_source,), (of_target,) = over_both(_geometry, None, source_inputs, target_inputs)
-    return of_source, of_target
+    of_source, of_target = over_both(_geometry, None, source_inputs, target_inputs)
+    return joined(*of_source), joined(*of_target)
 
 
 @cached_with_cloud
 def geometry_table(cloud: PointCloud, with_channels: bool) -> ComputedTable:
-    return differentiable_geometry(cloud, with_channels)
+    """Local geometry in two trees, see `joined`."""
+    return ComputedTable(_geometry, None, nb.with_near(cloud, with_channels), cloud.points.shape[0])
 
 
-def differentiable_geometry(cloud: PointCloud, with_channels: bool, fixed: PointCloud | None = None) -> ComputedTable:
-    """Local geometry of a cloud whose points differentiation may trace: then, `fixed` is the same cloud, concrete."""
-    values = None if fixed is None else geometry_table(fixed, with_channels)
-    # A view is another array than the differentiated channels, by which the local geometry has no derivative.
-    channels = np.asarray((cloud if fixed is None else fixed).channels).view()
-    inputs = nb.with_near(cloud.replace_rows(channels=channels), with_channels)
-    return ComputedTable(_geometry, None, inputs, cloud.points.shape[0], values)
+def differentiable_geometry(cloud: PointCloud, fixed: PointCloud, with_channels: bool) -> ComputedTable:
+    """`geometry_table` of a cloud whose points differentiation may trace; `fixed` is the same cloud, concrete."""
+    values = geometry_table(fixed, with_channels)
+    covariances = _NeighborCovariances(cloud.points, nb.check_neighbors(fixed, np), values)
+    return ComputedTable(_with_normal, None, [Input(covariances)], fixed.points.shape[0], values)
 
 
-def _geometry(_: None, own: Rows, near: Rows) -> tuple[LocalGeometry]:
-    return (local_geometry_of(nb.neighborhoods(own, near)),)
+def _geometry(_: None, own: Rows, near: Rows) -> tuple[Any, Any]:
+    return separated(local_geometry_of(nb.neighborhoods(own, near)))
+
+
+def separated(local: LocalGeometry) -> tuple[Any, Any]:
+    """Covariance and normal, and what is constant to autodiff, as trees of a row function."""
+    return local[:2], local[2:]
+
+
+def joined(shape: Any, constants: Any) -> LocalGeometry:
+    return LocalGeometry(*shape, *constants)
+
+
+def _with_normal(_: None, covariance: Rows) -> tuple[Any]:
+    return ((covariance.tree, alg.smallest_eigenvector(covariance.tree.T).T),)
+
+
+class _NeighborCovariances(GivenTable):
+    """The covariances of neighbourhoods as a table that depends on the points; values are those of a geometry table.
+
+    A covariance is Σ w x xᵀ − m mᵀ over the neighbours x, with their mean m = Σ w x. So derivatives are products with
+    the sparse matrix of the weights w, in float64; those of a row function of neighbourhoods take five times as long.
+    """
+
+    def __init__(self, points: Any, neighbors: Any, values: ComputedTable):
+        super().__init__(points)
+        self._neighbors, self._values = neighbors, values
+        self._points = self._packed[0].table.astype(np.float64)
+
+    def computed(self, rows: Any = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
+        (covariance, _), _ = (part.tree for part in self._values.computed(rows, num_threads))
+        return (Packed.of(covariance),)
+
+    def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Any = None) -> None:
+        weights, of_means = self._weights_and_slopes_of_means(slice(None) if rows is None else rows)
+        slopes = cotangents if rows is None else cotangents[rows]
+        sums, by_means = (
+            (weights.T @ part.reshape(len(part), -1)).reshape(self.size, *part.shape[1:])
+            for part in (slopes, slopes @ of_means)
+        )
+        by_points = sums @ _slopes_of_products(self._points)
+        by_points -= by_means
+        super().vjp(by_points, moving, into)
+
+    def jvp(self, tangents: Slopes, rows: Any) -> np.ndarray:
+        weights, of_means = self._weights_and_slopes_of_means(rows)
+        moved = super().jvp(tangents, slice(None))
+        products, means = (
+            (weights @ part.reshape(self.size, -1)).reshape(len(of_means), *part.shape[1:])
+            for part in (moved @ _slopes_of_products(self._points).swapaxes(1, 2), moved)
+        )
+        return products - means @ of_means.swapaxes(1, 2)
+
+    def _weights_and_slopes_of_means(self, rows: Any) -> tuple[csr_array, Float[np.ndarray, "n 6 3"]]:
+        """(n, N) weights, 1/k for each of the k neighbours of a point, and the derivatives of m mᵀ by m."""
+        index = np.asarray(self._neighbors[rows])
+        present = index >= 0
+        weights = present / np.maximum(present.sum(axis=1, keepdims=True), 1)
+        ends = np.arange(0, index.size + 1, index.shape[1])
+        matrix = csr_array((weights.ravel(), np.maximum(index, 0).ravel(), ends), shape=(len(index), self.size))
+        return matrix, _slopes_of_products(matrix @ self._points)
+
+
+def _slopes_of_products(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 6 3"]:
+    """The derivative of the entries of x xᵀ by x."""
+    entries, (i, j) = np.arange(6), np.triu_indices(3)
+    slopes = np.zeros((len(vectors), 6, 3))
+    slopes[:, entries, i] += vectors[:, j]
+    slopes[:, entries, j] += vectors[:, i]
+    return slopes
 
 
 class SurfaceNoise(NamedTuple):

@@ -25,7 +25,9 @@ from mcgicp_jax._local_geometry.local_geometry import (
     differentiable_geometry,
     geometry_of_cells,
     geometry_table,
+    joined,
     local_geometries,
+    separated,
 )
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, PointRows, neighborhoods, of_rows, with_near
 from mcgicp_jax._local_geometry.observability import channel_observability
@@ -153,7 +155,7 @@ def surface_pair(
         return SurfacePair(method, terms, of_source, of_target)
     inputs = [of_rows(_inputs(method, source, with_geometry), source_rows), _inputs(method, target, with_geometry)]
     if with_geometry:
-        inputs = [[*rows, Input(local)] for rows, local in zip(inputs, whole(), strict=True)]
+        inputs = [[*rows, *map(Input, separated(local))] for rows, local in zip(inputs, whole(), strict=True)]
     parts = over_both(_surface_rows(kinds, observed, with_geometry), method, *inputs)
     surfaces = _surface_in(parts[0], searchable(method, matched)), _surface_in(parts[1], searchable(method, target))
     return SurfacePair(method, terms, *surfaces)
@@ -256,7 +258,7 @@ def differentiable_inputs(
     with_geometry = observed or all(cloud.deferred_neighbors is not None for cloud in (source, target))
     inputs, kinds = [], kinds_of(terms)
     for cloud, same, rows in sides:
-        geometry = differentiable_geometry(cloud, method.uses_channels, same) if with_geometry else None
+        geometry = differentiable_geometry(cloud, same, method.uses_channels) if with_geometry else None
         values = surface_table(same, fixed_method, kinds, with_geometry, observed)
         inputs.append(Input(_table(cloud, method, kinds, geometry, observed, values), rows))
     if soft:
@@ -275,7 +277,9 @@ def _table(
     values: ComputedTable | None = None,
 ) -> ComputedTable:
     with_geometry = geometry is not None
-    inputs = _inputs(method, cloud, with_geometry) + ([Input(geometry)] if with_geometry else [])
+    inputs = _inputs(method, cloud, with_geometry)
+    if geometry is not None:
+        inputs += [Input(geometry), Input(geometry, part=1)]
     function = _surface_rows(kinds, observed, with_geometry)
     return ComputedTable(function, method, inputs, cloud.points.shape[0], values)
 
@@ -303,7 +307,7 @@ def _inputs(method: AbstractMethod, cloud: PointCloud, with_geometry: bool) -> l
 @cache
 def _surface_rows(kinds: Kinds, observed: bool, with_geometry: bool) -> Callable[..., Any]:
     def surface(method: AbstractMethod, own: Rows, *rest: Rows) -> tuple[Any, ...]:
-        near, local = (rest[:-1], rest[-1].tree) if with_geometry else (rest, None)
+        near, local = (rest[:-2], joined(*(part.tree for part in rest[-2:]))) if with_geometry else (rest, None)
         result = surface_of(method, kinds, neighborhoods(own, *near), local, observed)
         return (result,) if result.noise is None else (result._replace(noise=None), result.noise)
 

@@ -26,7 +26,7 @@ from mcgicp_jax._compute.linear_maps import KnownJacobian, primal, with_derivati
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.programs import COMPILATIONS, LOGGER
 from mcgicp_jax._compute.threads import num_cores, with_settings
-from mcgicp_jax._pairs.batch_jobs import BatchJob, Pair, PairResult, PreparedPair
+from mcgicp_jax._pairs.batch_jobs import NUM_CHECKED, BatchJob, Pair, PairResult, PreparedPair
 from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax._registration.assessment import fields_of_pose
 from mcgicp_jax._registration.options import Options
@@ -85,24 +85,32 @@ def run(
 
 def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor) -> list[RegistrationResult]:
     """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives."""
-    outcomes = {}
-    for pair in pairs:
-        if not is_concrete(pair.prior):
-            raise ValueError(f"priors[{pair.index}]: expected concrete arrays with an executor, got tracers")
-        outcomes[pair.index] = job.prepare(pair)
-    ready = {index: pair for index, pair in outcomes.items() if isinstance(pair, PreparedPair)}
-    for index, prepared in ready.items():
-        # With a prior, whose pose is in the user's frames, the equation of the centred pose depends on the origins.
-        if prepared.prior is not None and not is_concrete(*(cloud.origin for cloud in prepared.inputs[:2])):
-            raise ValueError(f"priors[{index}]: expected clouds with concrete origins with an executor, got tracers")
+    results: dict[int, RegistrationResult] = {}
+    prepared: dict[int, PreparedPair] = {}
+
+    def sent() -> Iterator[Pair]:
+        """The values of pairs, each prepared while workers have those before it."""
+        for pair in pairs:
+            if not is_concrete(pair.prior):
+                raise ValueError(f"priors[{pair.index}]: expected concrete arrays with an executor, got tracers")
+            # Workers find the neighbours, so that for a look at them a tree would be built here.
+            ready = job.prepare(pair, pair.index < NUM_CHECKED)
+            if isinstance(ready, PairResult):
+                results[pair.index] = ready.with_warning().registration
+                continue
+            # With a prior, whose pose is in the user's frames, the equation of the centred pose depends on the origins.
+            if ready.prior is not None and not is_concrete(*(cloud.origin for cloud in ready.inputs[:2])):
+                raise ValueError(
+                    f"priors[{pair.index}]: expected clouds with concrete origins with an executor, got tracers"
+                )
+            prepared[pair.index] = ready
+            source, target, *_ = ready.inputs.values()
+            yield Pair(pair.index, source, target, ready.init, ready.prior, ready.traced)
+
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
-    sent = (Pair(pair.index, *pair.inputs.values()[:2], pair.init, pair.prior, pair.traced) for pair in ready.values())
-    results = {index: result.with_warning() for index, result in outcomes.items() if index not in ready}
-    results |= {result.index: result for result in _results(fixed, sent, executor, len(ready))}
-    return [
-        _differentiable(results[index], ready[index]) if index in ready else results[index].registration
-        for index in outcomes
-    ]
+    for answer in _results(fixed, sent(), executor, None):
+        results[answer.index] = _differentiable(answer, prepared[answer.index])
+    return [results[index] for index in sorted(results)]
 
 
 def _differentiable(answer: PairResult, pair: PreparedPair) -> RegistrationResult:

@@ -53,7 +53,7 @@ from mcgicp_jax._search.brute_force import DenseSearch, default_search
 
 # Number of pairs of chunks whose neighbourhoods are looked at, for warnings: of 6.1 ms in which the host prepared a
 # pair of 2,000 points, this took 4.7, and the pairs of a batch are mostly alike.
-_CHECKED = 8
+NUM_CHECKED = 8
 
 # Rows of clouds that one thread prepares for chunks: most of this work is Python's, whose threads wait for each other
 # (on 16 cores, 433 pairs of 2,000 points per second by one thread, 310 by four, 260 by 16; of 6,000 points 270, 280,
@@ -180,15 +180,15 @@ class BatchJob:
         search = self.options.search
         return (on_accelerator() if search is None else isinstance(search, DenseSearch)) and not repeated
 
-    def ready(self, clouds: dict[str, Cloud]) -> list[PointCloud]:
+    def ready(self, clouds: dict[str, Cloud], checked: bool = True) -> list[PointCloud]:
         """Clouds by their names, read and preprocessed if necessary; errors become a `ValueError` that names one."""
-        options = self._options, self.voxel_size, self.num_neighbors, self.checked
+        options = self._options, self.voxel_size, self.num_neighbors, self.checked and checked
         return preprocessed(_read(clouds), self.method, *options)
 
     @_of_a_pair
-    def prepare(self, pair: Pair) -> PreparedPair | PairResult:
+    def prepare(self, pair: Pair, neighborhoods_checked: bool = True) -> PreparedPair | PairResult:
         with warnings_named(f"pair {pair.index}"):
-            source, target = self.ready({"source": pair.source, "target": pair.target})
+            source, target = self.ready({"source": pair.source, "target": pair.target}, neighborhoods_checked)
             if self.checked:
                 warn_of_lengths(source, target)
         options, soft = self.options, self.options.soft_matches is not False
@@ -286,7 +286,7 @@ class BatchJob:
             register = with_settings(unchecked._register_prepared)
 
             def prepared_pair(pair: Pair) -> PairResult | tuple[PreparedPair, ChunkPair]:
-                return (on_host if pair.index < _CHECKED else unchecked)._chunk_pair(pair)
+                return (on_host if pair.index < NUM_CHECKED else unchecked)._chunk_pair(pair)
 
             def ready() -> Iterator[tuple[PreparedPair, ChunkPair]]:
                 for pair in _computed_ahead(with_settings(prepared_pair), pairs, one, threads, 2 * num_threads):
