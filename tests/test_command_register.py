@@ -75,6 +75,17 @@ def test_all_commands_read_bin_files_of_given_columns(tmp_path, capsys, command)
     assert "columns: expected" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["odometry", "multiway", "batch"])
+def test_a_cloud_without_finite_points_is_named(tmp_path, capsys, command):
+    """Also where defaults depend on it."""
+    points, channels = room_corner(1000)
+    io.write(tmp_path / "0.npz", mcg.PointCloud(points, channels))
+    io.write(tmp_path / "1.npz", mcg.PointCloud(np.full_like(points, np.nan), channels))
+    options = ["--output", str(tmp_path / "table.csv")] if command == "batch" else []
+    assert main([command, str(tmp_path), *options, "--method", "ndt"]) == 2
+    assert "1.npz" in capsys.readouterr().err
+
+
 def close_to_truth(pose, factor=1.0):
     translation, rotation = metrics.pose_error(pose, TRUTH)
     return translation < 0.01 * factor and rotation < 0.01 * factor

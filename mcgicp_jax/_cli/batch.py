@@ -165,7 +165,7 @@ def _registration(folder: Path, pairs: Iterable[Key], method: Method, options: O
     print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
 
     def preprocessed() -> tuple[mcg.PointCloud, mcg.PointCloud]:
-        return choices.preprocess(source), choices.preprocess(target)
+        return choices.preprocess(names[0], source), choices.preprocess(names[1], target)
 
     resolved_method, arguments = choices.method(name, preprocessed), choices.arguments(name, preprocessed)
     arguments |= {"voxel_size": size, "num_neighbors": options.num_neighbors}

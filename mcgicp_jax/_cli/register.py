@@ -17,7 +17,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.choices import Choices, with_channels
 from mcgicp_jax._cli.options import PARAMETERS, File, Method, PairOptions, check_outputs, enumerated, with_names
-from mcgicp_jax._compute.messages import messages_named, warn
+from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.surfaces import resolved
@@ -54,14 +54,12 @@ class PreparedPair:
         self.verified = True
         read = partial(io.read, columns=options.columns)
         self.raw = read(source), read(target)
-        self.choices = Choices(options, (str(source), str(target)), self.raw)
-        self.preprocessed = self._preprocess(source, self.raw[0]), self._preprocess(target, self.raw[1])
+        names = str(source), str(target)
+        self.choices = Choices(options, names, self.raw)
+        preprocess = self.choices.preprocess
+        self.preprocessed = preprocess(names[0], self.raw[0]), preprocess(names[1], self.raw[1])
         in_source, in_target = (f"{len(self.preprocessed[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
         print(f"points:    source {in_source}, target {in_target} ({self.choices.voxels})")
-
-    def _preprocess(self, path: Path, cloud: mcg.PointCloud) -> mcg.PointCloud:
-        with messages_named(str(path)):
-            return self.choices.preprocess(cloud)
 
     def print_distances(self) -> None:
         target = self.preprocessed[1]
