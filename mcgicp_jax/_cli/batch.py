@@ -27,6 +27,7 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._cli.choices import Choices, listed, with_channels
+from mcgicp_jax._cli.flags import with_flags
 from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_names
 from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._pairs.processes import Processes
@@ -275,6 +276,6 @@ def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     values = (np.asarray(number).item() for number in (*quality, *result.matrix[:3].ravel(), *result.deviations))
     if not reason and result.status is mcg.Status.DEGENERATE:
         reason = f"unconstrained: {as_text(result.unconstrained_directions)}"
-    reason = " ".join((reason or result.status.advice).split())
+    reason = with_flags(" ".join((reason or result.status.advice).split()))
     texts = (*key, result.status.name.lower(), *map(repr, values), reason)
     return dict(zip(_COLUMNS, texts, strict=True))

@@ -16,6 +16,7 @@ from jaxtyping import Float
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.choices import Choices, with_channels
+from mcgicp_jax._cli.flags import with_flags
 from mcgicp_jax._cli.options import PARAMETERS, File, Method, PairOptions, check_outputs, enumerated, with_names
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
@@ -71,7 +72,7 @@ class PreparedPair:
             return
         result = mcg.global_pose(*(with_channels(cloud, self.choices.channels) for cloud in self.raw))
         if not result.num_inliers:
-            raise ValueError(f"--init global: found no pose, no features match ({result}); try --init with a file")
+            raise ValueError(doubt_of_start_pose(result))
         verdict = "found" if result.success else "ambiguous" if result.ambiguous else "unsure"
         print(f"start:     {verdict}, {result.num_inliers:,} of {result.num_matches:,} features match")
         self.start, self.verified = result.matrix, result.success
@@ -290,8 +291,8 @@ def _verdict(results: dict[str, mcg.RegistrationResult]) -> int:
         if not result.converged:
             failed.setdefault(result.status, []).append(name)
     for status, names in failed.items():
-        words = f"{', '.join(names)} did not converge ({_words(results[names[0]])})"
-        print(f"mcgicp: {words}: {status.advice}", file=sys.stderr)
+        words = _words(results[names[0]])
+        print(f"mcgicp: {', '.join(names)}: {words}: {with_flags(status.advice)}", file=sys.stderr)
     return 1 if failed else 0
 
 
