@@ -567,7 +567,8 @@ def refuses(path, shown=""):
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert str(caught.value).startswith(str(path)) and shown in str(caught.value)
+    message = str(caught.value)
+    assert message.startswith(str(path)) and shown in message and "\n" not in message
     assert peak < 50e6
 
 
@@ -607,6 +608,13 @@ def test_no_cloud(tmp_path, seeds, suffix):
     for content in contents.values():
         (tmp_path / f"c{suffix}").write_bytes(content)
         refuses(tmp_path / f"c{suffix}")
+
+
+@pytest.mark.parametrize("change", [("x y z", "x y"), ("4 4 4", "4 4 3"), ("F F F", "F F Q")])
+def test_a_damaged_pcd_header(tmp_path, change):
+    content = pcd("x y z", "F41 F41 F41", b"1 2 3\n4 5 6")
+    (tmp_path / "c.pcd").write_bytes(content.replace(*(text.encode() for text in change)))
+    refuses(tmp_path / "c.pcd", "c.pcd: cannot be read as .pcd: its header is damaged")
 
 
 @pytest.mark.parametrize("suffix", [s for s in FORMATS if s not in (".xyz", ".txt", ".csv")])
