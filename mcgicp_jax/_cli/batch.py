@@ -152,14 +152,15 @@ def _pairs_in(path: Path, glob: str) -> Starts:
 
 def _registration(folder: Path, pairs: Iterable[Key], method: Method, options: Options) -> Callable[..., Completed]:
     """A function that registers pairs by an executor, with defaults from the first pair that can be read."""
+    errors: list[Exception] = []
     for *names, _ in pairs:
         try:
             source, target = (io.read(folder / name, columns=options.columns) for name in names)
             break
         except (ValueError, OSError) as error:
-            reason = error
+            errors.append(error)
     else:
-        raise reason
+        raise ValueError(f"0 of {len(errors):,} pairs can be read; the first error: {errors[0]}")
     choices = Choices(options, names, (source, target))
     name = choices.method_name(method)
     size = None if options.voxel_size == "off" else options.voxel_size
