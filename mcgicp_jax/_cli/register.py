@@ -98,7 +98,8 @@ class PreparedPair:
             source = with_channels(self.raw[0], self.choices.channels)
         if "target" in method.needs_covariances:
             target = with_channels(self.raw[1], self.choices.channels)
-        return verified(mcg.register(source, target, method, init=self.start, **self.arguments(name)), self.verified)
+        init = None if self.options.init is None else self.start
+        return verified(mcg.register(source, target, method, init=init, **self.arguments(name)), self.verified)
 
     def arguments(self, name: str) -> dict[str, Any]:
         arguments = self.choices.arguments(name, lambda: self.preprocessed)

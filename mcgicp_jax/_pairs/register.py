@@ -210,7 +210,8 @@ def register(
     result = verified(register_pair(source, target, method, pose, options, tie_points, prior), trusted)
     doubt = doubt_of(result)
     if doubt:
-        warn(doubt if isinstance(init, str) else f'{doubt}; pass a better init, or init="global"')
+        advice = ', such as init="global"' if init is None else ""
+        warn(f"{doubt}; pass a better init{advice}")
     return result
 
 
