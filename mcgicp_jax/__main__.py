@@ -16,6 +16,7 @@ import tyro
 
 from mcgicp_jax import __version__
 from mcgicp_jax._cli.batch import batch
+from mcgicp_jax._cli.flags import with_flags
 from mcgicp_jax._cli.multiway import multiway
 from mcgicp_jax._cli.odometry import odometry
 from mcgicp_jax._cli.register import compare, demo, register
@@ -55,7 +56,7 @@ def _run(args: Sequence[str]) -> int:
     LOGGER.addHandler(handler)
     LOGGER.setLevel(logging.INFO)
     with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: print(f"mcgicp: {message}", file=sys.stderr)
+        warnings.showwarning = lambda message, *_, **__: print(f"mcgicp: {with_flags(str(message))}", file=sys.stderr)
         try:
             return tyro.extras.subcommand_cli_from_dict(
                 {command.__name__: command for command in commands},
@@ -78,7 +79,7 @@ def _run(args: Sequence[str]) -> int:
             print(f"mcgicp: {problem}; unset it, or install its plugin", file=sys.stderr)
             return 2
         except (ValueError, OSError, ImportError) as error:
-            reason = " ".join(str(error).split())
+            reason = with_flags(" ".join(str(error).split()))
             if isinstance(error, OSError) and error.filename is not None:
                 reason = f"{error.filename}: {error.strerror}"
             print(f"mcgicp: {reason}", file=sys.stderr)

@@ -158,7 +158,8 @@ def test_a_list_that_makes_no_sense(tmp_path, capsys):
         ("source,target\n", "pairs"),
         ("source,target\nx.ply,\n", "line 2"),
         ("source,target\nx.ply,y.ply\nx.ply,y.ply\n", "once"),
-        ("source,target\nx.ply,y.ply\n", "x.ply"),
+        ("source,target\nx.ply,y.ply\nz.ply,y.ply\n", "0 of 2 pairs can be read; the first error: "),
+        ("source,target\nx.ply,y.ply\nz.ply,y.ply\n", "x.ply"),
         (",".join(["source,target", *POSE]) + "\nx.ply,y.ply" + 12 * ",a", "line 2"),
         ("\x80\xff", "pairs.csv: "),
     ):

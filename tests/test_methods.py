@@ -1,12 +1,25 @@
 """The five methods: what they weigh a pair with, what they search, and the numbers that they choose from the data."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.spatial
 
-from mcgicp_jax import GICP, ColorICP, MultiChannelGICP, PointCloud, PointToPlane, PointToPoint, preprocess
+from mcgicp_jax import (
+    D2DNDT,
+    GICP,
+    NDT,
+    ColorICP,
+    ColorNDT,
+    MultiChannelGICP,
+    PointCloud,
+    PointToPlane,
+    PointToPoint,
+    preprocess,
+)
 from tests import reference as ref
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
 from tests.refusals import refused
@@ -242,6 +255,19 @@ def test_the_numbers_of_a_method_are_arrays(name):
     assert len(repr(method)) < 400
 
 
+def test_the_fields_of_a_method_are_its_arguments():
+    for method in (
+        ColorICP([0.5, 3]),
+        ColorICP(0.5, 0.1),
+        ColorNDT(0.5, 2),
+        NDT(None),
+        D2DNDT(3),
+        MultiChannelGICP(0.3),
+    ):
+        pasted = eval(repr(method))
+        assert repr(pasted) == repr(dataclasses.replace(pasted)) == repr(method)
+
+
 @pytest.mark.parametrize(
     "make, named",
     [
@@ -255,6 +281,7 @@ def test_the_numbers_of_a_method_are_arrays(name):
         *((lambda v=v: MultiChannelGICP(np.ones(v)), "channel_covariance") for v in ((2, 3), (1, 2, 2))),
         *((lambda v=v: MultiChannelGICP(1.0, v), "channel_weights") for v in (-0.1, [0.1, np.inf], np.ones((2, 2)))),
         *((lambda v=v: ColorICP(v), "channel_weights") for v in (-1.0, "red", np.nan)),
+        (lambda: ColorICP(1.0, -1.0), "missing_variance"),
         (lambda: prepare(ColorICP(np.array([1.0, 2.0])), ready()), "channel_weights"),
         (lambda: prepare(MultiChannelGICP(np.array([1.0, 2.0]), 0.1), ready()), "channel_covariance"),
         (lambda: prepare(MultiChannelGICP(np.eye(2), 0.1), ready()), "channel_covariance"),

@@ -487,9 +487,15 @@ def test_a_pose_from_a_small_overlap_is_unverified(transformation):
         result = mcg.register(source.replace(points=points), target, mcg.PointToPlane(), max_distance=1.0)
         return result.matrix, result
 
-    warned = contextlib.nullcontext() if transformation is jax.jit else pytest.warns(UserWarning, match="of the source")
+    warned = (
+        contextlib.nullcontext()
+        if transformation is jax.jit
+        else pytest.warns(UserWarning, match='such as init="global"$')
+    )
     with warned:
         result = jax.tree.leaves(transformation(registered)(source.points), is_leaf=lambda leaf: hasattr(leaf, "rmse"))[
             -1
         ]
     assert result.status == Status.UNVERIFIED and 0 < result.overlap < 0.1 and np.isfinite(result.matrix).all()
+    with pytest.warns(UserWarning, match="of the source points have a match, .* pass a better init$"):
+        mcg.register(source, target, mcg.PointToPlane(), init=np.eye(4), max_distance=1.0)

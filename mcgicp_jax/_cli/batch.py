@@ -27,6 +27,7 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._cli.choices import Choices, listed, with_channels
+from mcgicp_jax._cli.flags import with_flags
 from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_names
 from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._pairs.processes import Processes
@@ -151,21 +152,22 @@ def _pairs_in(path: Path, glob: str) -> Starts:
 
 def _registration(folder: Path, pairs: Iterable[Key], method: Method, options: Options) -> Callable[..., Completed]:
     """A function that registers pairs by an executor, with defaults from the first pair that can be read."""
+    errors: list[Exception] = []
     for *names, _ in pairs:
         try:
             source, target = (io.read(folder / name, columns=options.columns) for name in names)
             break
         except (ValueError, OSError) as error:
-            reason = error
+            errors.append(error)
     else:
-        raise reason
+        raise ValueError(f"0 of {len(errors):,} pairs can be read; the first error: {errors[0]}")
     choices = Choices(options, names, (source, target))
     name = choices.method_name(method)
     size = None if options.voxel_size == "off" else options.voxel_size
     print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
 
     def preprocessed() -> tuple[mcg.PointCloud, mcg.PointCloud]:
-        return choices.preprocess(source), choices.preprocess(target)
+        return choices.preprocess(names[0], source), choices.preprocess(names[1], target)
 
     resolved_method, arguments = choices.method(name, preprocessed), choices.arguments(name, preprocessed)
     arguments |= {"voxel_size": size, "num_neighbors": options.num_neighbors}
@@ -275,6 +277,6 @@ def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     values = (np.asarray(number).item() for number in (*quality, *result.matrix[:3].ravel(), *result.deviations))
     if not reason and result.status is mcg.Status.DEGENERATE:
         reason = f"unconstrained: {as_text(result.unconstrained_directions)}"
-    reason = " ".join((reason or result.status.advice).split())
+    reason = with_flags(" ".join((reason or result.status.advice).split()))
     texts = (*key, result.status.name.lower(), *map(repr, values), reason)
     return dict(zip(_COLUMNS, texts, strict=True))

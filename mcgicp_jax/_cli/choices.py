@@ -12,6 +12,7 @@ from mcgicp_jax._cli.options import Options
 from mcgicp_jax._clouds.columns import COLORS
 from mcgicp_jax._clouds.point_cloud import Voxels
 from mcgicp_jax._clouds.voxel_size import voxels_for
+from mcgicp_jax._compute.messages import messages_named
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax.extend import COLOR_SPACES, METHODS, AbstractMethod
 
@@ -48,10 +49,12 @@ class Choices:
     def _channels_of_each(self) -> str:
         return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in self.first_two.items())
 
-    def preprocess(self, cloud: mcg.PointCloud) -> mcg.PointCloud:
+    def preprocess(self, name: str, cloud: mcg.PointCloud) -> mcg.PointCloud:
+        """The preprocessed cloud; warnings and errors name it."""
         # Where the user asks for all points, `preprocess` warns of neighbourhoods that do not span the surface.
         voxels = None if self.options.voxel_size == "off" else self.voxels
-        return mcg.preprocess(with_channels(cloud, self.channels), voxels, self.options.num_neighbors)
+        with messages_named(name):
+            return mcg.preprocess(with_channels(cloud, self.channels), voxels, self.options.num_neighbors)
 
     def method(self, name: str, preprocessed: Preprocessed) -> AbstractMethod:
         """The method with the user's parameters; the default weights of Color ICP are those of mc-gicp."""

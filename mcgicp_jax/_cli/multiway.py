@@ -49,8 +49,9 @@ def multiway(
     shared.check(method)
     paths = clouds_in(folder, glob, map).paths
     raw = [io.read(path, columns=shared.columns) for path in paths]
-    choices = Choices(shared, [path.name for path in paths], raw)
-    clouds = [choices.preprocess(cloud) for cloud in raw]
+    names = [path.name for path in paths]
+    choices = Choices(shared, names, raw)
+    clouds = [choices.preprocess(name, cloud) for name, cloud in zip(names, raw, strict=True)]
     voxels = choices.voxels
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
     name = choices.method_name(method)

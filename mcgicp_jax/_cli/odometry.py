@@ -126,12 +126,13 @@ def odometry(
     # If the second frame cannot be read, `mcg.odometry` raises the error and names the frame.
     with contextlib.suppress(ValueError, OSError):
         start.append(frames[1].cloud)
-    choices = Choices(shared, ("the first frame", "the second"), start)
+    names = frames.name(0), frames.name(1)
+    choices = Choices(shared, names, start)
     name = choices.method_name(method)
     print(f"points:    {choices.voxels}")
 
     def source_and_target() -> tuple[mcg.PointCloud, mcg.PointCloud]:
-        return choices.preprocess(start[-1]), choices.preprocess(first.cloud)
+        return choices.preprocess(names[1], start[-1]), choices.preprocess(names[0], first.cloud)
 
     resolved_method = choices.method(name, source_and_target)
     options = choices.arguments(name, source_and_target)
@@ -149,7 +150,7 @@ def odometry(
             yield with_channels(frame.cloud, choices.channels)
 
     steps = mcg.odometry(clouds(), resolved_method, voxel_size=choices.voxels.size, **options)
-    poses, results, failure = _follow(steps, len(frames), loops, map)
+    poses, results, failure = _follow(steps, frames, loops, map)
     del truth[len(poses) :], times[len(poses) :]
     _report(poses, truth, results)
 
@@ -207,7 +208,7 @@ def _open(
 
 
 def _follow(
-    steps: Iterator[OdometryStep], num_frames: int, loops: bool, map: Path | None
+    steps: Iterator[OdometryStep], frames: AbstractFrames, loops: bool, map: Path | None
 ) -> tuple[list[Pose], list[mcg.RegistrationResult], str]:
     """Run the odometry and write the map; return the poses, the registrations, and why it stopped early, or ''."""
     poses: list[Pose] = []
@@ -215,7 +216,7 @@ def _follow(
     clouds: list[mcg.PointCloud] = []
     world, last, failure = None, None, ""
     try:
-        for step in tqdm(steps, total=num_frames, unit="frame", disable=None):
+        for step in tqdm(steps, total=len(frames), unit="frame", disable=None):
             # Loops change all poses until the end. Without loops, clouds go into the map at once, to save memory.
             if map is not None and loops:
                 clouds.append(step.cloud)
@@ -230,7 +231,7 @@ def _follow(
         # An error of the first frame is raised.
         if not poses:
             raise
-        failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"frame {len(poses)}: {error}"
+        failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{frames.name(len(poses))}: {error}"
     if loops and last is not None:
         graph: Any = last.graph
         print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")
@@ -243,7 +244,10 @@ def _follow(
 
 
 def _report(poses: list[Pose], truth: list[Pose | None], results: list[mcg.RegistrationResult]) -> None:
-    iterations = np.mean([np.asarray(result.num_iterations) for result in results]) if results else 0
+    if not results:
+        print("pairs:     none were registered")
+        return
+    iterations = np.mean([np.asarray(result.num_iterations) for result in results])
     converged = sum(bool(result.converged) for result in results)
     print(f"pairs:     {converged} of {len(results)} converged, {iterations:.1f} iterations on average")
     rows = [row for row, pose in enumerate(truth) if pose is not None]

@@ -16,8 +16,9 @@ from jaxtyping import Float
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli.choices import Choices, with_channels
+from mcgicp_jax._cli.flags import with_flags
 from mcgicp_jax._cli.options import PARAMETERS, File, Method, PairOptions, check_outputs, enumerated, with_names
-from mcgicp_jax._compute.messages import messages_named, warn
+from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.surfaces import resolved
@@ -54,14 +55,12 @@ class PreparedPair:
         self.verified = True
         read = partial(io.read, columns=options.columns)
         self.raw = read(source), read(target)
-        self.choices = Choices(options, (str(source), str(target)), self.raw)
-        self.preprocessed = self._preprocess(source, self.raw[0]), self._preprocess(target, self.raw[1])
+        names = str(source), str(target)
+        self.choices = Choices(options, names, self.raw)
+        preprocess = self.choices.preprocess
+        self.preprocessed = preprocess(names[0], self.raw[0]), preprocess(names[1], self.raw[1])
         in_source, in_target = (f"{len(self.preprocessed[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
         print(f"points:    source {in_source}, target {in_target} ({self.choices.voxels})")
-
-    def _preprocess(self, path: Path, cloud: mcg.PointCloud) -> mcg.PointCloud:
-        with messages_named(str(path)):
-            return self.choices.preprocess(cloud)
 
     def print_distances(self) -> None:
         target = self.preprocessed[1]
@@ -73,7 +72,7 @@ class PreparedPair:
             return
         result = mcg.global_pose(*(with_channels(cloud, self.choices.channels) for cloud in self.raw))
         if not result.num_inliers:
-            raise ValueError(f"--init global: found no pose, no features match ({result}); try --init with a file")
+            raise ValueError(doubt_of_start_pose(result))
         verdict = "found" if result.success else "ambiguous" if result.ambiguous else "unsure"
         print(f"start:     {verdict}, {result.num_inliers:,} of {result.num_matches:,} features match")
         self.start, self.verified = result.matrix, result.success
@@ -99,7 +98,8 @@ class PreparedPair:
             source = with_channels(self.raw[0], self.choices.channels)
         if "target" in method.needs_covariances:
             target = with_channels(self.raw[1], self.choices.channels)
-        return verified(mcg.register(source, target, method, init=self.start, **self.arguments(name)), self.verified)
+        init = None if self.options.init is None else self.start
+        return verified(mcg.register(source, target, method, init=init, **self.arguments(name)), self.verified)
 
     def arguments(self, name: str) -> dict[str, Any]:
         arguments = self.choices.arguments(name, lambda: self.preprocessed)
@@ -292,8 +292,8 @@ def _verdict(results: dict[str, mcg.RegistrationResult]) -> int:
         if not result.converged:
             failed.setdefault(result.status, []).append(name)
     for status, names in failed.items():
-        words = f"{', '.join(names)} did not converge ({_words(results[names[0]])})"
-        print(f"mcgicp: {words}: {status.advice}", file=sys.stderr)
+        words = _words(results[names[0]])
+        print(f"mcgicp: {', '.join(names)}: {words}: {with_flags(status.advice)}", file=sys.stderr)
     return 1 if failed else 0
 
 

@@ -37,7 +37,7 @@ class _Compilations:
         if before <= _LONG < self.seconds:
             folder = jax.config.values["jax_compilation_cache_dir"]
             kept = f"programs are kept in {folder}" if folder else "help(mcgicp_jax) says how to keep programs"
-            LOGGER.info("compiling, once for each method, but with DenseSearch once for each size of clouds; %s", kept)
+            LOGGER.info("compiling, mostly once for each method; %s", kept)
 
 
 COMPILATIONS = _Compilations()

@@ -40,7 +40,7 @@ _VERIFIED_WITHIN, _VERIFIED_ITERATIONS, _NUM_NEIGHBORS = (4.0, fit.TOLERANCE), 4
 # Smallest i/√n (a/m)² of a success (see `GlobalPoseResult.support`), in general and where the shape of the clouds
 # leaves a direction unconstrained, and smallest number of inliers: from the development half of
 # `tests/benchmarks/global_pose_verdicts`.
-_LEAST, _LEAST_UNCONSTRAINED, _MIN_INLIERS = 0.21, 0.7, 10
+_LEAST, _LEAST_UNCONSTRAINED, MIN_INLIERS = 0.21, 0.7, 10
 # For each of these numbers that exceeds the number N of voxels, a success needs (number / N)^1.5 times as much. Where
 # walls coincide at a wrong pose, 15 to 60 matches are inliers by chance, however few there are, and furniture is no
 # larger than a neighbourhood of a sparse cloud. 3,000: on the development half no wrong pose is accepted with powers of
@@ -289,7 +289,7 @@ def _best_pose(scene: _Scene, source_center: np.ndarray, target_center: np.ndarr
         pose.matrix[:3, 3] += target_center - pose.matrix[:3, :3] @ source_center
     best, *others = sorted(verified, key=lambda pose: -pose.evidence)
     runner_up = max(others, key=lambda pose: (pose.rivals(best), pose.evidence), default=None)
-    enough = best.num_inliers >= _MIN_INLIERS and best.support >= 1
+    enough = best.num_inliers >= MIN_INLIERS and best.support >= 1
     rivalled = runner_up is not None and runner_up.rivals(best)
     return GlobalPoseResult(
         matrix=best.matrix,

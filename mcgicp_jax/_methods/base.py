@@ -39,12 +39,12 @@ def epsilon_of(value: ArrayLike) -> Float[Array, ""]:
     return epsilon
 
 
-def weights_of(value: Values) -> Float[Array, "..."]:
-    weights = number_of("channel_weights", value)
+def weights_of(value: Values, name: str = "channel_weights") -> Float[Array, "..."]:
+    weights = number_of(name, value)
     if weights.ndim > 1:
-        raise ValueError(f"channel_weights: expected a scalar or shape (C,), got {weights.shape}")
+        raise ValueError(f"{name}: expected a scalar or shape (C,), got {weights.shape}")
     if is_concrete(weights) and not np.all((np.asarray(weights) >= 0) & np.isfinite(weights)):
-        raise ValueError(f"channel_weights: expected finite numbers of at least 0, got {value!r}")
+        raise ValueError(f"{name}: expected finite numbers of at least 0, got {value!r}")
     return weights
 
 

@@ -61,7 +61,7 @@ class ColorICP(base.AbstractOneSided):
     Attributes:
         channel_weights: α, scalar or (C,), metres per channel unit.
         missing_variance: scalar or (C,), channel units²: the squared difference that the search assumes for a channel
-            if a point of a correspondence lacks it. Not an argument: set by `resolve` if points lack channels.
+            if a point of a correspondence lacks it. None: set by `resolve` if points lack channels.
     """
 
     uses_channels: ClassVar[bool] = True
@@ -69,10 +69,12 @@ class ColorICP(base.AbstractOneSided):
     channel_weights: Float[Array, "..."]
     missing_variance: Float[Array, "..."] | None
 
-    def __init__(self, channel_weights: Values):
-        """Raises `ValueError` if a weight is negative or not finite, or has the wrong shape."""
+    def __init__(self, channel_weights: Values, missing_variance: Values | None = None):
+        """Raises `ValueError` if a weight or variance is negative or not finite, or has the wrong shape."""
         self.channel_weights = base.weights_of(channel_weights)
-        self.missing_variance = None
+        if missing_variance is not None:
+            missing_variance = base.weights_of(missing_variance, "missing_variance")
+        self.missing_variance = missing_variance
 
     @with_settings_of_package
     def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> ColorICP:

@@ -23,7 +23,7 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
-from mcgicp_jax._math.robust_kernels import AbstractKernel, Welsch
+from mcgicp_jax._math.robust_kernels import AbstractKernel, Welsch, positive_scalar
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, AbstractOneSided, identity
 from mcgicp_jax._methods.icp import GICP, ColorICP
 from mcgicp_jax._methods.surfaces import covariances_of
@@ -282,10 +282,10 @@ class AbstractNDT(AbstractMethod):
     """Methods for clouds of `voxel_gaussians`, whose covariances are in m².
 
     Attributes:
-        kernel: robust kernel, its scale in standard deviations, if `register` is not given another one.
+        scale: k of the Welsch kernel, in standard deviations, if `register` is not given another kernel; None: none.
     """
 
-    kernel: AbstractKernel | None
+    scale: Float[Array, ""] | None
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
         """The covariances given with the cloud."""
@@ -295,7 +295,8 @@ class AbstractNDT(AbstractMethod):
     def terms(
         self, source: PointCloud, target: PointCloud, robust: AbstractKernel | None, equalize_channels: bool
     ) -> tuple[AbstractTerm, ...]:
-        return (Mahalanobis(self, robust=self.kernel if robust is None else robust),)
+        kernel = robust if robust is not None or self.scale is None else Welsch(self.scale)
+        return (Mahalanobis(self, robust=kernel),)
 
 
 class NDT(AbstractNDT, AbstractOneSided):
@@ -313,7 +314,7 @@ class NDT(AbstractNDT, AbstractOneSided):
 
     def __init__(self, scale: ArrayLike | None = _SCALE):
         """Raises `ValueError` unless `scale` is positive."""
-        self.kernel = _welsch(scale)
+        self.scale = _scale_of(scale)
 
     def information(
         self, target: Float[Array, "6 N"], source: Float[Array, "6 N"], rotation: Float[Array, "3 3"]
@@ -328,14 +329,16 @@ class ColorNDT(NDT, ColorICP):
     α · channel as in position.
 
     Args:
-        channel_weights: α, scalar or (C,), metres per channel unit.
+        channel_weights, missing_variance: as of `ColorICP`.
         scale: as of `NDT`.
     """
 
-    def __init__(self, channel_weights: Values, scale: ArrayLike | None = _SCALE):
-        """Raises `ValueError` if a weight is negative or not finite or of the wrong shape, or `scale` not positive."""
-        ColorICP.__init__(self, channel_weights)
-        self.kernel = _welsch(scale)
+    def __init__(
+        self, channel_weights: Values, scale: ArrayLike | None = _SCALE, missing_variance: Values | None = None
+    ):
+        """Raises `ValueError` as `ColorICP` and `NDT` do."""
+        ColorICP.__init__(self, channel_weights, missing_variance)
+        self.scale = _scale_of(scale)
 
 
 class D2DNDT(AbstractNDT, AbstractGeneralized):
@@ -354,9 +357,9 @@ class D2DNDT(AbstractNDT, AbstractGeneralized):
     def __init__(self, scale: ArrayLike | None = _SCALE, num_candidates: int = _NUM_CANDIDATES):
         """Raises `ValueError` unless `scale` is positive and `num_candidates` at least 1."""
         check_integer("num_candidates", num_candidates, 1)
-        self.kernel = _welsch(scale)
+        self.scale = _scale_of(scale)
         self.num_candidates = num_candidates
 
 
-def _welsch(scale: Any) -> Welsch | None:
-    return None if scale is None else Welsch(scale)
+def _scale_of(value: ArrayLike | None) -> Float[Array, ""] | None:
+    return None if value is None else positive_scalar("scale", value)

@@ -119,8 +119,8 @@ def register_as_completed(
     Raises:
         ValueError: if an argument common to all pairs is malformed, or the iterables differ in length.
     Warns:
-        PairWarning: the reason for each pair with the status `INVALID_INPUT`, `WORKER_FAILED` or `UNVERIFIED`; a
-            `UserWarning`.
+        PairWarning: the reason for each pair with the status `INVALID_INPUT`, `WORKER_FAILED` or `UNVERIFIED`, or for
+            which `global_pose` finds no pose; a `UserWarning`.
     """
     job = _job(method, options, voxel_size, num_neighbors, covariances, priors is not None)
     workers = executor_of(executor)

@@ -199,10 +199,10 @@ class BatchJob:
             init = pair.prior[0] if pair.init is None and pair.prior is not None else pair.init
             return PreparedPair(pair.index, inputs, primal(init), pair.prior)
         start = start_from_anywhere(pair.init, primal(source), primal(target))
-        if start is None:
-            return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES))
-        distance = coarse_distance_from(start, options)
-        return PreparedPair(pair.index, inputs, start.matrix, pair.prior, doubt_of_start_pose(start), distance)
+        distance, doubt = coarse_distance_from(start, options), doubt_of_start_pose(start)
+        if not start.num_inliers:
+            return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES), doubt)
+        return PreparedPair(pair.index, inputs, start.matrix, pair.prior, doubt, distance)
 
     @computed_on_cpu
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:

@@ -13,7 +13,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
-from mcgicp_jax._global_pose.global_pose import GlobalPoseResult, global_pose
+from mcgicp_jax._global_pose.global_pose import MIN_INLIERS, GlobalPoseResult, global_pose
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
@@ -173,9 +173,9 @@ def register(
             matched points differ by a factor, probably because of another exposure; channels seem to move with the
             sensor (they are left out, or a pose that they alone hold is UNVERIFIED); extent and spacing of the clouds
             differ so much that their units of length probably differ; or `GICP` gets one cloud with covariances that
-            are not dimensionless. Outside of `jit`: if the pose is UNVERIFIED, why; if channels or `channel_weights`
-            are differentiated with `soft_matches=False`; or channels are while `channel_covariance` or, unless it is
-            False, `channel_weights` is None.
+            are not dimensionless. Outside of `jit`: if the pose is UNVERIFIED, or `global_pose` finds none, why; if
+            channels or `channel_weights` are differentiated with `soft_matches=False`; or channels are while
+            `channel_covariance` or, unless it is False, `channel_weights` is None.
     """
     options_of(register, unknown)
     check_method(method)
@@ -201,16 +201,17 @@ def register(
     pose: Any = init
     if isinstance(init, str):
         start = start_from_anywhere(init, primal(source), primal(target))
-        if start is None:
-            return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         pose, trusted = start.matrix, start.success
         if not trusted:
             warn(doubt_of_start_pose(start))
+        if not start.num_inliers:
+            return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         options = replace(options, max_coarse_distance=coarse_distance_from(start, options))
     result = verified(register_pair(source, target, method, pose, options, tie_points, prior), trusted)
     doubt = doubt_of(result)
     if doubt:
-        warn(doubt if isinstance(init, str) else f'{doubt}; pass a better init, or init="global"')
+        advice = ', such as init="global"' if init is None else ""
+        warn(f"{doubt}; pass a better init{advice}")
     return result
 
 
@@ -219,8 +220,11 @@ def doubt_of_start_pose(start: GlobalPoseResult) -> str:
         return ""
     if start.ambiguous:
         return "global pose: the matches of features support another pose as well, so that it is UNVERIFIED"
-    count = f"{start.num_inliers} of {start.num_matches}"
-    return f"global pose: only {count} matches of features support it, so that it is UNVERIFIED"
+    count = f"{start.num_inliers} of {start.num_matches} matches of features"
+    if not start.num_inliers:
+        return f"global pose: none found, {count} support one; pass a pose as init"
+    evidence = f"{count}, and a support of {start.support:.2g}; {MIN_INLIERS} and 1 are needed"
+    return f"global pose: too little evidence ({evidence}), so that it is UNVERIFIED"
 
 
 def coarse_distance_from(start: GlobalPoseResult, options: Options) -> float:
@@ -238,11 +242,10 @@ def doubt_of(result: RegistrationResult) -> str | None:
     return f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
 
 
-def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult | None:
-    """The initial pose of a registration with `init="global"`; None if no match supports any pose."""
+def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult:
+    """The initial pose of a registration with `init="global"`; without inliers, none was found."""
     if init != "global":
         raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
     if not is_concrete(source, target):
         raise ValueError('init: expected a pose inside transformations, got "global"')
-    start = global_pose(source, target)
-    return start if start.num_inliers else None
+    return global_pose(source, target)

@@ -27,7 +27,8 @@ class Status(enum.IntEnum):
         CONVERGED: the last update was below both tolerances, and every direction of motion is constrained.
         MAX_ITERATIONS: the updates were still above the tolerances after `max_iterations` updates.
         TOO_FEW_CORRESPONDENCES: fewer than four source points (in the coarse phase: of the subset) have a match within
-            `max_distance`: the clouds do not overlap, or the initial pose is too far off.
+            `max_distance`: the clouds do not overlap, or the initial pose is too far off. With `init="global"`, also if
+            `global_pose` finds no pose, which is then NaN.
         DEGENERATE: the last update was below both tolerances, but at least one direction of motion is unconstrained
             (see `RegistrationResult.unconstrained_directions`). With `hold_unconstrained`, updates move the pose only
             along directions that are constrained when they are made: along others it remains the initial one. Tie
@@ -71,7 +72,8 @@ _ADVICE = {
     Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
     "try init with a better initial pose, another max_distance, or a larger max_iterations",
     Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
-    "are both clouds in metres? If so, try global as init, or a pose at which they overlap",
+    "are both clouds in metres? If so, pass a pose at which they overlap as init; global may find one, unless it was "
+    "the init",
     Status.DEGENERATE: "the pose is unconstrained in at least one direction; try clouds that show more of the scene, "
     "or MC-GICP and clouds with channels, or fix that direction if the initial pose is right in it",
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",

@@ -244,11 +244,11 @@ def _ambiguity(best: Candidate[Any], rivals: list[Candidate[Any]], little: bool,
     nearest = min(best, rival, key=lambda candidate: candidate.moved)
     changing = rival.state.status == Status.MAX_ITERATIONS
     another = "another that is still changing" if changing else "another"
-    coincide = "" if changing or little else ", at which surfaces coincide about as well"
+    coincide = "" if changing or little else ", where the surfaces coincide about as well"
     # Two distances would lead to the same doubt.
-    advice = f"max_distance={nearest.limit} if the initial pose is good to {fine:.2g} m, or "
+    advice = f"max_distance={nearest.limit} if the initial pose is good to {fine:.2g} m, or else "
     return (
-        f"{common}max_distance={best.limit} leads from the initial pose to this one, {best.moved:.2g} m away, and "
-        f"max_distance={rival.limit} to {another}, {apart:.2g} m from this one{coincide}; pass "
+        f"{common}max_distance={best.limit} leads to this pose, {best.moved:.2g} m from the initial one, but "
+        f"max_distance={rival.limit} to {another}, {apart:.2g} m from this one{coincide}. Pass "
         f"{advice if len(nearest.max_distance) == 1 else ''}a better init"
     )

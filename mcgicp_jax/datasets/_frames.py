@@ -65,6 +65,10 @@ class AbstractFrames(Sequence[Frame]):
             return _Slice(self, range(len(self))[index])
         return self._frame(self._row(index))
 
+    def name(self, index: int) -> str:
+        """Frame `index` in messages."""
+        return f"frame {index}"
+
     def crop(self, min_range: float = 0.0, max_range: float = np.inf) -> AbstractFrames:
         """The frames, lazily, with the points whose distance from the sensor is in a range, metres; without images."""
         return _Cropped(self, min_range, max_range)
@@ -87,6 +91,9 @@ class _Slice(AbstractFrames):
     def _frame(self, index: int) -> Frame:
         return self._whole[self._rows[index]]
 
+    def name(self, index: int) -> str:
+        return self._whole.name(self._rows[index])
+
 
 class _Cropped(AbstractFrames):
     def __init__(self, whole: AbstractFrames, min_range: float, max_range: float):
@@ -96,6 +103,9 @@ class _Cropped(AbstractFrames):
     def _frame(self, index: int) -> Frame:
         frame = self._whole[index]
         return Frame(frame.cloud.crop(*self._range), frame.pose, frame.time)
+
+    def name(self, index: int) -> str:
+        return self._whole.name(index)
 
 
 class SyntheticFrames(AbstractFrames):
@@ -265,3 +275,6 @@ class CloudFiles(AbstractFrames):
 
     def _frame(self, index: int) -> Frame:
         return Frame(io.read(self.paths[index], columns=self._columns))
+
+    def name(self, index: int) -> str:
+        return f"frame {index} ({self.paths[index].name})"

@@ -56,7 +56,7 @@ def columns_of_floats(values: Float[np.ndarray, "n"], width: int | None = None) 
     if columns is not None and steps[3] < _REPEATS * min(steps[size] for size in (4, 5, 7, 10)):
         return named(columns)
     fitting = [str(size) for size in _SIZES if values.size % size == 0]
-    advice = f"if they begin with x, y, z, say how many there are, columns=N or --columns N; {', '.join(fitting)} fit"
+    advice = f"if they begin with x, y, z, say how many there are, columns=N; {', '.join(fitting)} fit"
     raise ValueError(
         "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; "
         + (advice if fitting else f"no number of {_SIZES[0]} to {_SIZES[-1]} fills {4 * values.size} bytes")

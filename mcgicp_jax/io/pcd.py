@@ -19,10 +19,17 @@ _LZF_RATIO = 100
 
 def read_pcd(file: BinaryIO, size: int) -> PointCloud:
     pypcd4 = optional_module("pypcd4", "io", "reading .pcd files")
-    metadata, start = pypcd4.MetaData.parse_header(_pcd_header(file)), file.tell()
+    header, start = _pcd_header(file), file.tell()
+    try:
+        metadata = pypcd4.MetaData.parse_header(header)
+        columns = zip(metadata.fields, metadata.size, metadata.type, metadata.count, strict=True)
+        widths = [count * np.dtype(f"{kind}{size}".lower()).itemsize for _, size, kind, count in columns]
+    except (ValueError, TypeError) as error:
+        # Those of pydantic have several lines.
+        raise ValueError("its header is damaged") from error
     if metadata.points == 0:
         raise ValueError("it has no points")
-    num_bytes = metadata.points * sum(width * count for width, count in zip(metadata.size, metadata.count, strict=True))
+    num_bytes = metadata.points * sum(widths)
     if metadata.data == pypcd4.Encoding.ASCII:
         check_size(2 * metadata.points * sum(metadata.count), size + 1)
         # pypcd4's own ASCII reader accepts only single spaces between numbers.

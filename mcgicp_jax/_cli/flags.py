@@ -1,0 +1,22 @@
+"""Messages of the Python functions in the words of the command line."""
+
+from __future__ import annotations
+
+import re
+
+from mcgicp_jax._cli.options import PairOptions
+
+
+def with_flags(message: str) -> str:
+    """The message with arguments of Python, such as max_distance=(1, 0.2), as options of the command line."""
+
+    def flag(match: re.Match[str]) -> str:
+        name, value = match.groups("")
+        # Some names are words, too.
+        if name not in PairOptions.__dataclass_fields__ or not (value or "_" in name):
+            return match[0]
+        value = re.sub(r'[(),"]|True', "", value)
+        return f"--{name.replace('_', '-')} {value}".rstrip()
+
+    # Not within paths and names of attributes.
+    return re.sub(r'(?<![\w./-])([a-z_]+)(?:=(\(.*?\)|"\w+"|\w+(?:\.\w+)?))?(?![\w/-]|\.\w)', flag, message)
