@@ -185,6 +185,7 @@ def test_a_batch_in_chunks_is_its_pairs(raw, clouds):
         assert max(pose_error(again.matrix, results[i].matrix)) < 1e-6
 
 
+@pytest.mark.slow
 def test_raw_clouds_in_chunks_are_prepared_as_one_by_one(raw, monkeypatch):
     """Neighbours, surfaces and parameters are computed on the device, by one program for pairs that fill at least half
     of the size of the first. A pair without enough points does no harm."""
@@ -213,6 +214,7 @@ def test_raw_clouds_in_chunks_are_prepared_as_one_by_one(raw, monkeypatch):
         assert np.isnan(results[i].covariance).all() and np.isfinite(expected[i].covariance).all()
 
 
+@pytest.mark.slow
 def test_pairs_that_may_have_left_a_right_pose_are_registered_again(monkeypatch):
     """Parts of rooms whose coarse phase leaves it, views with too little in common for a promise, and a whole room that
     is hardly moved."""
@@ -284,7 +286,7 @@ def test_pairs_of_many_updates_leave_their_chunk_and_lose_nothing(clouds, monkey
 def test_given_neighbours_stay_where_a_channel_is_left_out(raw, on_host, monkeypatch):
     """Its first channel moves with the sensor: `register` works on copies of the clouds. Of the first pairs the host
     finds out, and warns; of others the program does."""
-    monkeypatch.setattr(batch_jobs, "_CHECKED", 8 if on_host else 0)
+    monkeypatch.setattr(batch_jobs, "NUM_CHECKED", 8 if on_host else 0)
     sides = []
     for side in (0, 1):
         points, channels = (np.asarray(array) for array in (raw[0][side].points, raw[0][side].channels))

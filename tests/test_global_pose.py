@@ -343,6 +343,7 @@ def test_walls_alone_do_not_suffice_in_sparse_clouds(seed, common, place):
     assert not result.success or found(result, truth, source)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "common"), [(3, 0.67), (1, 0.5)])
 def test_furniture_decides_where_walls_coincide_twice(seed, common):
     """The wrong pose has more overlap and half of the inliers, or more, but its surfaces coincide less."""
@@ -475,7 +476,8 @@ def test_a_global_pose_that_is_unsure_leaves_the_registration_unverified():
     assert lost.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
 
 
-@pytest.mark.parametrize("against", [pytest.param("previous", marks=pytest.mark.slow), "map"])
+@pytest.mark.slow
+@pytest.mark.parametrize("against", ["previous", "map"])
 def test_a_lost_frame_is_found_in_the_map(against):
     """The sensor is carried away, looks at nothing it knows, and comes back turned round."""
     frames = list(datasets.box_room(6, points_per_frame=1500, step=0.08))

@@ -172,6 +172,7 @@ def test_invalid_numbers_are_named(clouds):
         refused(lambda o=options: mcg.register_batch(clouds, clouds, mcg.GICP(), **o), "max_source_points", wrong)
 
 
+@pytest.mark.slow
 def test_odometry_and_multiway_match_at_most_10000_points():
     clouds = pair(size=10_500)[1::-1]
     steps = [list(mcg.odometry(clouds, mcg.PointToPoint(), **given))[1] for given in ({}, {"max_source_points": None})]

@@ -376,6 +376,7 @@ def test_without_channels_the_term_is_off():
     np.testing.assert_allclose(result.matrix, expected, atol=tolerance(1e-6, 1e-12))
 
 
+@pytest.mark.slow
 def test_the_covariance_covers_every_direction_of_a_small_cloud():
     """The error in units of the covariance, direction by direction: on small clouds, a few large cells said of one
     direction that it hardly scatters (122 times too small a variance here)."""

@@ -514,7 +514,7 @@ def test_traced_and_batched_results_agree_with_single_ones():
     [
         pytest.param(mcg.GICP(), id="gicp"),
         pytest.param(mcg.NDT(), id="ndt", marks=pytest.mark.slow),
-        pytest.param(mcg.D2DNDT(), id="d2d-ndt"),
+        pytest.param(mcg.D2DNDT(), id="d2d-ndt", marks=pytest.mark.slow),
     ],
 )
 def test_normalised_squared_errors_are_one_on_average(method):
