@@ -159,7 +159,7 @@ WAYS = {
     "estimate_pose inside": lambda problem: problem.compiled(problem.inputs),
 }
 QUICK = [*((name, "register outside") for name in (*HARD_CASES, "covariances"))]
-QUICK += [("point-to-point", "register in lanes"), ("point-to-point", "estimate_pose inside")]
+QUICK += [("mc-gicp", "register in lanes"), ("point-to-point", "estimate_pose inside")]
 SLOW = [(name, way) for name in HARD_CASES for way in ("register in lanes", "estimate_pose inside")]
 SLOW += [("covariances", "estimate_pose inside")]
 SLOW += [
