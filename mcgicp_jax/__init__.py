@@ -138,4 +138,4 @@ __all__ = [
     "rgb_to_yuv",
     "voxel_gaussians",
 ]
-__version__ = "0.3.1"
+__version__ = "0.4.0"

@@ -259,6 +259,7 @@ def test_pairs_of_shapes_that_the_method_refuses(raw):
     assert [result.status for result in results] == [Status.INVALID_INPUT] * 2
 
 
+@pytest.mark.slow
 def test_a_bad_pair_spoils_no_other(clouds):
     expected = in_chunks(*clouds)
     sources, targets = (list(side) for side in clouds)
@@ -272,6 +273,7 @@ def test_a_bad_pair_spoils_no_other(clouds):
         assert_same(results[i : i + 1], expected[i : i + 1])
 
 
+@pytest.mark.slow
 def test_pairs_of_many_updates_leave_their_chunk_and_lose_nothing(clouds, monkeypatch):
     expected = in_chunks(*clouds)
     updates = sorted(int(result.num_iterations) for result in expected)
@@ -281,6 +283,7 @@ def test_pairs_of_many_updates_leave_their_chunk_and_lose_nothing(clouds, monkey
     assert not found
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:channel channel_0")
 @pytest.mark.parametrize("on_host", [True, False])
 def test_given_neighbours_stay_where_a_channel_is_left_out(raw, on_host, monkeypatch):
@@ -306,6 +309,7 @@ def test_units_are_warned_of_in_chunks_too(raw):
         mcg.register_batch([source], [target], mcg.GICP(), max_distance=0.5, search=DenseSearch())
 
 
+@pytest.mark.slow
 def test_a_stream_yields_invalid_pairs_and_those_of_many_updates_on_the_way(clouds, monkeypatch):
     sources, targets = ([side[1]] * 63 for side in clouds)
     sources[2] = np.zeros((3, 3))
@@ -323,6 +327,7 @@ def test_a_stream_yields_invalid_pairs_and_those_of_many_updates_on_the_way(clou
     assert max(list(ended).index(number) for number in (0, 2)) < 40
 
 
+@pytest.mark.slow
 def test_pairs_that_nobody_waits_for_are_not_prepared(clouds, monkeypatch):
     prepared_pair, indices = BatchJob._chunk_pair, []
 
@@ -341,6 +346,7 @@ def test_pairs_that_nobody_waits_for_are_not_prepared(clouds, monkeypatch):
     assert len(indices) < count + 50
 
 
+@pytest.mark.slow
 def test_a_rare_size_does_not_wait_for_the_end(clouds, monkeypatch):
     monkeypatch.setattr(chunks, "_PATIENCE", 2)
     # 490 points fill the larger size class, the others the smaller, whose pairs do not come first: they would join.

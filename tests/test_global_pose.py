@@ -454,6 +454,7 @@ def test_register_starts_from_anywhere():
     refused(lambda: traced(ready.points), "init")
 
 
+@pytest.mark.slow
 def test_a_global_pose_that_is_unsure_leaves_the_registration_unverified():
     clouds = strangers(1000)
     start = mcg.global_pose(*clouds)

@@ -145,7 +145,8 @@ def test_nearest_with_missing_channels(seed, share, k, missing):
     np.testing.assert_array_equal(found.T, expected)
 
 
-@pytest.mark.parametrize("k", [1, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("k", [1, 3])
 def test_many_sets_of_missing_channels(k):
     """Five channels, each there or not at random, hence more sets than have their trees kept."""
     squares = np.arange(1.0, 6.0)

@@ -338,7 +338,10 @@ def seen_by_a_camera(frame, share, shape):
     return mcg.PointCloud(frame.cloud.points, np.where(outside[:, None], 0, frame.cloud.channels))
 
 
-@pytest.mark.parametrize(("share", "shape"), [(0.6, "disc"), (0.75, "disc"), (0.6, "half")])
+@pytest.mark.parametrize(
+    ("share", "shape"),
+    [(0.6, "disc"), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0.75, "disc"), (0.6, "half")))],
+)
 def test_the_edge_of_an_image_moves_with_the_camera(share, shape):
     """It held the pose of this wall where the camera was."""
     frames = mcg.datasets.poster_wall(2, seed=1)

@@ -163,6 +163,7 @@ def test_a_pattern_that_moves_with_the_sensor_constrains_nothing(moves, status):
     assert mcg.register(*clouds, mcg.MultiChannelGICP(), init=ahead).status == status
 
 
+@pytest.mark.slow
 def test_channels_that_do_not_agree_constrain_nothing():
     """A wall of posters, half a metre apart: from the identity the pose comes to rest 0.4 m off, where posters lie on
     others."""
@@ -394,6 +395,7 @@ def test_geometry_and_channels_have_discounts_of_their_own(monkeypatch):
     np.testing.assert_allclose(shown, 0.4 * information + 0.7 * information / (1 + 0.7 * trace), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_covariance_is_a_covariance():
     source, target, _ = pair()
     matches = mcg.find_correspondences(source, target, motion(), mcg.GICP(), max_distance=0.5)

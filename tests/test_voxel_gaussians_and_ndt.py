@@ -391,7 +391,7 @@ def test_what_is_wrong_is_named(raw):
     refused(lambda: traced(target.points), "cloud", "concrete")
 
 
-@pytest.mark.parametrize("noise", [0.25, 1.0])
+@pytest.mark.parametrize("noise", [pytest.param(0.25, marks=pytest.mark.slow), 1.0])
 @pytest.mark.parametrize("scene", ["plane", "floor and wall", "corridor", "crossing planes", "room"])
 def test_cells_of_noisy_surfaces_hold_nothing_by_chance(scene, noise):
     """Noise in spacings of the points. The truth is the start."""
