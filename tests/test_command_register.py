@@ -327,7 +327,9 @@ def test_messages_have_options_of_the_command_line():
     for message, expected in (
         ('max_distance=(1, 0.2) or init="global"', "--max-distance 1 0.2 or --init global"),
         ("try another max_distance; use equalize_channels=True", "try another --max-distance; use --equalize-channels"),
+        ("max_distance: expected columns=N", "--max-distance: expected --columns N"),
         *((text, text) for text in ("no channels in common", "/a/max_distance/b: cut", "max_distance.ply: cut")),
+        *((text, text) for text in ("channels=3.npz: cut", "max_distance=(1, 0.2).npz: cut (at 3)", "columns=3: cut")),
     ):
         assert with_flags(message) == expected
 

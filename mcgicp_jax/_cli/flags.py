@@ -18,5 +18,6 @@ def with_flags(message: str) -> str:
         value = re.sub(r'[(),"]|True', "", value)
         return f"--{name.replace('_', '-')} {value}".rstrip()
 
-    # Not within paths and names of attributes.
-    return re.sub(r'(?<![\w./-])([a-z_]+)(?:=(\(.*?\)|"\w+"|\w+(?:\.\w+)?))?(?![\w/-]|\.\w)', flag, message)
+    # Not within paths, also those of files such as max_distance=(1, 0.2).npz.
+    value = r'\([\d., ]+\)|"\w+"|[\d.]*\d|True|N'
+    return re.sub(rf"(?<![\w./-])([a-z_]+)(?:=({value})(?!:))?(?![\w/=-]|\.\w)", flag, message)

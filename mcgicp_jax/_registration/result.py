@@ -70,10 +70,9 @@ class Status(enum.IntEnum):
 _ADVICE = {
     Status.CONVERGED: "",
     Status.MAX_ITERATIONS: "the pose was still changing after the last iteration; "
-    "try init with a better initial pose, another max_distance, or a larger max_iterations",
+    "try a better initial pose, another max_distance, or a larger max_iterations",
     Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
-    "are both clouds in metres? If so, pass a pose at which they overlap as init; global may find one, unless it was "
-    "the init",
+    "are both clouds in metres? If so, they need an initial pose at which they overlap; a global search may find one",
     Status.DEGENERATE: "the pose is unconstrained in at least one direction; try clouds that show more of the scene, "
     "or MC-GICP and clouds with channels, or fix that direction if the initial pose is right in it",
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
