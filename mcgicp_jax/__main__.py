@@ -20,6 +20,7 @@ from mcgicp_jax._cli.flags import with_flags
 from mcgicp_jax._cli.multiway import multiway
 from mcgicp_jax._cli.odometry import odometry
 from mcgicp_jax._cli.register import compare, demo, register
+from mcgicp_jax._compute.messages import reason_of
 from mcgicp_jax._compute.programs import LOGGER
 
 
@@ -79,9 +80,12 @@ def _run(args: Sequence[str]) -> int:
             print(f"mcgicp: {problem}; unset it, or install its plugin", file=sys.stderr)
             return 2
         except (ValueError, OSError, ImportError) as error:
-            reason = with_flags(" ".join(str(error).split()))
-            if isinstance(error, OSError) and error.filename is not None:
-                reason = f"{error.filename}: {error.strerror}"
+            reason = with_flags(reason_of(error))
+            # A word such as epsilon is an option if one was given.
+            name, _, rest = reason.partition(": ")
+            option = f"--{name.replace('_', '-')}"
+            if any(argument.split("=")[0] == option for argument in args):
+                reason = f"{option}: {rest}"
             print(f"mcgicp: {reason}", file=sys.stderr)
             return 2
         finally:

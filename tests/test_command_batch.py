@@ -122,7 +122,7 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     for name in ("missing.ply", "notes.txt"):
         assert rows[name]["status"] == "invalid_input" and name in rows[name]["reason"]
     text, errors = capsys.readouterr()
-    assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors
+    assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors and "Errno" not in errors
     assert "done:      4 of 4, " in text and f"table:     {output}\n" in text
     # Files that cannot be read have no rate.
     assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1

@@ -294,7 +294,7 @@ def broken(folder):
         *(([good, good, "--init", path], path) for path in (good, str(folder / "two.txt"), str(folder / "scaled.txt"))),
         ([good, good, "--channel-weights", "1"], "gicp has no --channel-weights"),
         *(
-            ([good, good, f"--{name}", value], f"{name}: ")
+            ([good, good, f"--{name}", value], f"mcgicp: --{name}: ")
             for name, value in (
                 *(("epsilon", "-1"), ("voxel-size", "-1"), ("num-neighbors", "1"), ("max-distance", "0")),
                 *(("max-iterations", "0"), ("max-source-points", "3")),

@@ -18,7 +18,7 @@ import tyro
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, plot
 from mcgicp_jax._clouds.preprocess import check_preprocessing
-from mcgicp_jax._compute.messages import check_integer, check_positive
+from mcgicp_jax._compute.messages import check_integer, check_positive, messages_named
 from mcgicp_jax._registration.options import ROTATION_TOLERANCE
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax.extend import COLOR_SPACES, FORMATS, KERNELS, METHODS
@@ -175,7 +175,8 @@ class Options:
             options["max_distance"] = self.max_distance if len(self.max_distance) == 2 else self.max_distance[0]
         if self.robust is not None:
             name, scale = self.robust
-            options["robust"] = KERNELS[name](scale)
+            with messages_named("robust"):
+                options["robust"] = KERNELS[name](scale)
         return options
 
 

@@ -40,7 +40,14 @@ def messages_named(name: str) -> Iterator[None]:
         with warnings_named(name):
             yield
     except (ValueError, OSError) as error:
-        raise ValueError(f"{name}: {error}") from error
+        raise ValueError(f"{name}: {reason_of(error)}") from error
+
+
+def reason_of(error: Exception) -> str:
+    """The error in one line; of files, without its number."""
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())
 
 
 def calling_line() -> Line:
