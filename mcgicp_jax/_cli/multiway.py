@@ -82,7 +82,13 @@ def multiway(
         status = result.graph.status
         why = ": no pair constrains some directions of motion" if status == mcg.Status.DEGENERATE else ""
         print(f"mcgicp: the poses are {status.name}{why}", file=sys.stderr)
-    for path, status in zip(paths, result.statuses, strict=True):
-        if status != mcg.Status.CONVERGED:
-            print(f"mcgicp: {path}: {status.name}, its pose contradicts the others or is not known", file=sys.stderr)
+    for i, (path, status) in enumerate(zip(paths, result.statuses, strict=True)):
+        if status == mcg.Status.CONVERGED:
+            continue
+        found = {registration.status.name for pair, registration in result.registrations.items() if i in pair}
+        if found and mcg.Status.CONVERGED.name not in found:
+            why = f"none of its registrations converged: {', '.join(sorted(found))}"
+        else:
+            why = f"{status.name}, its pose contradicts the others or is not known"
+        print(f"mcgicp: {path}: {why}", file=sys.stderr)
     return 0 if result.converged else 1
