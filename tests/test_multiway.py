@@ -175,7 +175,7 @@ def test_the_command(room, tmp_path, capsys):
     assert "expected clouds *.las, found none" in capsys.readouterr().err
     given = ["--glob", "[01].ply", "--method", "gicp", "--max-distance", "1.0", "--max-iterations", "1"]
     assert main(["multiway", str(folder), *given]) == 1
-    assert "0.ply: none of its registrations converged: MAX_ITERATIONS" in capsys.readouterr().err
+    assert "0.ply: no registration holds its pose (statuses: MAX_ITERATIONS)" in capsys.readouterr().err
 
 
 def test_the_command_of_odometry(tmp_path, capsys):

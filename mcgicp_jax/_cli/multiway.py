@@ -85,10 +85,9 @@ def multiway(
     for i, (path, status) in enumerate(zip(paths, result.statuses, strict=True)):
         if status == mcg.Status.CONVERGED:
             continue
+        why = f"{status.name}, its pose contradicts the others or is not known"
         found = {registration.status.name for pair, registration in result.registrations.items() if i in pair}
-        if found and mcg.Status.CONVERGED.name not in found:
-            why = f"none of its registrations converged: {', '.join(sorted(found))}"
-        else:
-            why = f"{status.name}, its pose contradicts the others or is not known"
+        if status == mcg.Status.TOO_FEW_CORRESPONDENCES and found:
+            why = f"no registration holds its pose (statuses: {', '.join(sorted(found))})"
         print(f"mcgicp: {path}: {why}", file=sys.stderr)
     return 0 if result.converged else 1
