@@ -80,13 +80,7 @@ def _run(args: Sequence[str]) -> int:
             print(f"mcgicp: {problem}; unset it, or install its plugin", file=sys.stderr)
             return 2
         except (ValueError, OSError, ImportError) as error:
-            reason = with_flags(reason_of(error))
-            # A word such as epsilon is an option if one was given.
-            name, _, rest = reason.partition(": ")
-            option = f"--{name.replace('_', '-')}"
-            if any(argument.split("=")[0] == option for argument in args):
-                reason = f"{option}: {rest}"
-            print(f"mcgicp: {reason}", file=sys.stderr)
+            print(f"mcgicp: {with_flags(reason_of(error), args)}", file=sys.stderr)
             return 2
         finally:
             LOGGER.removeHandler(handler)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 from mcgicp_jax._cli.options import PairOptions
 
 
-def with_flags(message: str) -> str:
-    """The message with arguments of Python, such as max_distance=(1, 0.2), as options of the command line."""
+def with_flags(message: str, args: Sequence[str] = ()) -> str:
+    """The message with arguments of Python, such as max_distance=(1, 0.2), as options of the command line; also the
+    name with which it begins, if that is an option among `args`."""
+    name, *rest = message.split(": ", maxsplit=1)
+    option = f"--{name.replace('_', '-')}"
+    if any(argument.split("=")[0] == option for argument in args):
+        message = ": ".join([option, *rest])
 
     def flag(match: re.Match[str]) -> str:
         name, value = match.groups("")

@@ -44,7 +44,7 @@ def messages_named(name: str) -> Iterator[None]:
 
 
 def reason_of(error: Exception) -> str:
-    """The error in one line; of files, without its number."""
+    """The message in one line; of an error of the system, the file and the cause."""
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return " ".join(str(error).split())

@@ -211,7 +211,7 @@ class _NeighborCovariances(GivenTable):
         self._points = self._packed[0].table.astype(np.float64)
 
     def computed(self, rows: Any = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
-        (covariance, _), _ = (part.tree for part in self._values.computed(rows, num_threads))
+        covariance, _ = self._values.computed(rows, num_threads)[0].tree
         return (Packed.of(covariance),)
 
     def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Any = None) -> None:

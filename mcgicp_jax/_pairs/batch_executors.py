@@ -93,7 +93,6 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
         for pair in pairs:
             if not is_concrete(pair.prior):
                 raise ValueError(f"priors[{pair.index}]: expected concrete arrays with an executor, got tracers")
-            # Workers find the neighbours, so that for a look at them a tree would be built here.
             ready = job.prepare(pair, pair.index < NUM_CHECKED)
             if isinstance(ready, PairResult):
                 results[pair.index] = ready.with_warning().registration

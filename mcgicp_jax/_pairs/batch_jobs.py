@@ -51,8 +51,8 @@ from mcgicp_jax._registration.result import RegistrationResult, Status, computed
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, checked_measurements
 from mcgicp_jax._search.brute_force import DenseSearch, default_search
 
-# Number of pairs of chunks whose neighbourhoods are looked at, for warnings: of 6.1 ms in which the host prepared a
-# pair of 2,000 points, this took 4.7, and the pairs of a batch are mostly alike.
+# Number of pairs whose neighbourhoods are looked at, for warnings, where a device or a worker finds the neighbours: of
+# 6.1 ms in which the host prepared a pair of 2,000 points, this took 4.7, and the pairs of a batch are mostly alike.
 NUM_CHECKED = 8
 
 # Rows of clouds that one thread prepares for chunks: most of this work is Python's, whose threads wait for each other
