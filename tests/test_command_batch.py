@@ -161,6 +161,8 @@ def test_a_list_that_makes_no_sense(tmp_path, capsys):
         ("source,target\nx.ply,y.ply\nz.ply,y.ply\n", "0 of 2 pairs can be read; the first error: "),
         ("source,target\nx.ply,y.ply\nz.ply,y.ply\n", "x.ply"),
         (",".join(["source,target", *POSE]) + "\nx.ply,y.ply" + 12 * ",a", "line 2"),
+        (",".join(["source,target", *POSE[:-1], "m32"]) + "\nx.ply,y.ply" + 12 * ",1", "or none, got no m23"),
+        (",".join(["source,target", *POSE]).upper().replace("SOURCE,TARGET", "source,target"), "or none, got no m00"),
         ("\x80\xff", "pairs.csv: "),
     ):
         (tmp_path / "pairs.csv").write_bytes(content.encode("latin-1"))

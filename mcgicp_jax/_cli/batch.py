@@ -129,17 +129,21 @@ def _pairs_in(path: Path, glob: str) -> Starts:
     columns = reader.fieldnames or []
     if not {"source", "target"} <= set(columns):
         raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
+    missing = [name for name in _POSE if name not in columns]
+    # Or else a misspelt column would leave out all initial poses.
+    if missing and any(re.fullmatch(r"m\d\d", name.lower()) for name in columns):
+        raise ValueError(f"{path}: expected all of the columns m00 ... m23, or none, got no {missing[0]}")
     pairs: list[tuple[Key, Any]] = []
     for row in reader:
         line = f"{path}: line {reader.line_num}"
         if not row["source"] or not row["target"]:
-            raise ValueError(f"{line}: expected two files, got {row}")
+            raise ValueError(f"{line}: expected two files in the columns source and target")
         init, numbers = None, list[float]()
-        if set(_POSE) <= set(columns):
+        if not missing:
             try:
                 numbers = [float(row[name]) for name in _POSE]
             except (TypeError, ValueError) as error:
-                raise ValueError(f"{line}: expected numbers in m00 ... m23, got {row}") from error
+                raise ValueError(f"{line}: expected numbers in the columns m00 ... m23") from error
             init = np.vstack([np.reshape(numbers, (3, 4)), [0, 0, 0, 1]])
         pairs.append(((row["source"], row["target"], " ".join(map(repr, numbers))), init))
     if not pairs:
