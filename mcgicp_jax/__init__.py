@@ -49,11 +49,14 @@ Results
     PairWarning                     why a pair of a batch is invalid, or its pose doubtful
     metrics, plot                   errors of poses; pictures
 
+To read
+    guide                           phases, derivatives and priors explained
+
 To extend (see mcgicp_jax.extend)
     AbstractMethod, AbstractKernel, AbstractSearch, AbstractTreeSearch
 """
 
-from mcgicp_jax import datasets, io, metrics, plot
+from mcgicp_jax import datasets, guide, io, metrics, plot
 from mcgicp_jax._clouds.color_spaces import rgb_to_hsv, rgb_to_lab, rgb_to_yuv
 from mcgicp_jax._clouds.deskew import deskew
 from mcgicp_jax._clouds.point_cloud import PointCloud
@@ -120,6 +123,7 @@ __all__ = [
     "estimate_pose",
     "find_correspondences",
     "global_pose",
+    "guide",
     "image_matches",
     "io",
     "mahalanobis_cost",

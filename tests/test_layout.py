@@ -25,6 +25,7 @@ LAYERS = (
     "_pairs",
     "_pose_graph",
     "_sequences",
+    "guide",
     "metrics",
     "io",
     "datasets",

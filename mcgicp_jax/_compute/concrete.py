@@ -31,7 +31,7 @@ else:
 class DeferredRows:
     """A concrete array, such as the neighbours of points, whose rows are computed when they are needed.
 
-    As a pytree it is the whole array: what JAX passes through a transformation, copies or pickles is computed first.
+    As a pytree it is the whole array: flattening it computes all rows, as do transformations and copies.
 
     Args:
         compute: as of `RowsOnDemand`.

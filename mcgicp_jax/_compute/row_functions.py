@@ -56,7 +56,7 @@ class Rows(NamedTuple):
 
 
 class Input(NamedTuple):
-    """What a row function gets of a table: for row i of its result, row i of the table, or the rows `index[i]`.
+    """A table and the rows of it that row i of the result uses: row i, or the rows `index[i]`.
 
     Attributes:
         table: a `Table`, or a pytree of arrays, also traced ones.
@@ -254,7 +254,7 @@ class RowFunction:
 class ComputedTable(RowFunction):
     """The result of a row function, whose rows are computed when they are first used. Threads may share it.
 
-    Trees after the first are constants to autodiff; tangents and cotangents are those of the `columns` that move alone.
+    Only the first tree is differentiable. Derivatives cover the `columns` that depend on differentiated inputs.
     `values` is a table with the same values, from which rows are taken. `computed` gives the packed trees, in which
     some rows (None: all) are computed, and others may not be.
     """
@@ -351,8 +351,8 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
         total: whether the function returns a sum.
 
     Returns:
-        What the function returns, for all rows. Of several returned trees of rows, those after the first are constants
-        to autodiff. Outside `jit`, first derivatives only.
+        What the function returns, for all rows. Of several trees of rows, only the first is differentiable. Outside
+        `jit`, first derivatives only.
 
     Raises:
         ValueError: if an input is no `Input`; if the function returns no tuple of trees, and `total` is False; if it is

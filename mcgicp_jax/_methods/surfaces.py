@@ -293,7 +293,7 @@ def _descriptors(method: AbstractMethod, own: Rows) -> tuple[SearchPoints]:
 
 
 def _surface_in(parts: tuple[Any, ...], search: SearchPoints) -> Surface:
-    """The columns, with noise and search; those of a table are views, from which the executor on the host gathers."""
+    """The surface with its noise and search points. Arrays of a table are views: do not modify them."""
     surface, *noise = parts
     return surface._replace(noise=noise[0] if noise else None, search=search)
 

@@ -111,7 +111,7 @@ def register_as_completed(
             It compiles for each combination of sizes, rounded up to 128, 192, 256, 384, ... points, for 20 to 40 s,
             but not for one that fits in an earlier one of at most 1,024 points, or fills half of it. Only the first
             eight pairs are looked at for warnings of neighbourhoods, units and patterns in channels. Pairs that may
-            have left a right initial pose, see `register`, are registered again on the CPU.
+            have left a right initial pose (`mcgicp_jax.guide`) are registered again on the CPU.
 
     Returns:
         A generator of the index of the pair, from 0, and its `RegistrationResult`.

@@ -54,32 +54,10 @@ def register(
 ) -> RegistrationResult:
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
-    A coarse phase uses the larger `max_distance`, and of 8,192 source points or more an even subset of at least 4,096.
-    Near convergence, a fine phase with all points and the smaller `max_distance` takes over.
-
-    The coarse phase may leave a right `init`, for instance where clouds were cut out of merged scans. If it has moved
-    the points by more than the fine distance to a pose at which the surfaces do not coincide, a second registration
-    from `init` uses the fine distance alone, and is the result if they coincide better. With fewer than 4,000 matches,
-    and no channel that constrains the pose, there is also a second registration if the first one is DEGENERATE, or has
-    moved the points by more than half of the coarse distance. If the surfaces coincide about as well at a pose nearer
-    to `init`, this pose replaces a DEGENERATE one, and any other pose is UNVERIFIED. If the first registration does not
-    converge, and at the pose of the second, which does, the surfaces coincide about as well, that pose is the result,
-    UNVERIFIED. None of this is done inside transformations: pass a small `max_distance` there if `init` is near.
-
-    Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host and calls compiled programs whose
-    shapes do not depend on the sizes of the clouds. Inside `jit`, it is one program per size of clouds, whose matches
-    come from host callbacks, one batch element at a time (with `DenseSearch`, from XLA). The pose is the same up to
-    rounding; its derivative is that of `estimate_pose` at matches found at this pose.
-
-    The derivative is by points, channels, given covariances and given parameters; that by `init` is 0. Matches,
-    neighbours and estimated parameters are constants. Since channels act mostly by the matches, and α by them alone,
-    these are several candidates per point whose weights have derivatives: see `soft_matches`.
-    Of a DEGENERATE pose it is that within the constrained directions, which are constants, too, and 0 along the others.
-    UNVERIFIED poses, and those after MAX_ITERATIONS, have a derivative as if they had converged. After other failures
-    it is 0, never NaN. It is 0, too, if Newton's method finds no root of the soft matches, as for some pairs of 60
-    points whose channels are noise.
-    Outside `jit`, value and gradient take two to five registrations, for clouds of any size; inside, each size compiles
-    for some ten seconds, so pad clouds (`PointCloud.pad`). `register_batch` differentiates many pairs at once.
+    A coarse phase, with the larger `max_distance` and an even subset of large clouds, is followed by a fine phase with
+    all points and the smaller one. Outside transformations, a pose that may have left a right `init` is checked by a
+    second registration. Works under `jit`, `vmap`, `grad` and `jvp`. `help(mcgicp_jax.guide)` explains the phases, this
+    check, the derivative of the pose, tie points and priors.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
@@ -87,9 +65,9 @@ def register(
         method: `MultiChannelGICP()`, `GICP()`, `PointToPlane()`, `PointToPoint()`, `ColorICP(...)`; for clouds of
             `voxel_gaussians` or with `voxel_sizes`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are
             estimated.
-        init: initial T_target_source, `jaxlie.SE3` or (4, 4); the identity by default. "global": the pose found by
-            `global_pose`. If it does not succeed, the status is UNVERIFIED, or if it finds no pose at all,
-            TOO_FEW_CORRESPONDENCES, and the pose NaN. "global" is not available inside transformations.
+        init: initial T_target_source, `jaxlie.SE3` or (4, 4); None: the pose of the `prior`, or the identity. "global":
+            the pose found by `global_pose`, not inside transformations. If it does not succeed, the status is
+            UNVERIFIED, or if it finds no pose at all, TOO_FEW_CORRESPONDENCES, and the pose NaN.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. Two numbers,
             for the coarse and for the fine phase, or one for both: points without a partner then pull the pose. None:
             10 and 2.5 times the spacing of the target (its median nearest-neighbour distance, or the edge of its
@@ -114,50 +92,26 @@ def register(
             with different exposure or gain. A first registration uses the distributions of all points, and a second
             one from its pose those of matched points. With `MultiChannelGICP(photometric=True)`, gains and offsets are
             instead estimated from interpolated channels, together with the pose.
-        voxel_sizes: voxel sizes in metres, coarse to fine, for multi-scale registration. Each scale starts from the
-            pose of the previous one with the default `max_distance`; a given `max_distance` applies to the final
-            registration at full resolution. For NDT these are cell sizes; raw clouds have more points per cell than
-            preprocessed ones. The last size gives the result, and at the others `GICP` registers voxels of a quarter of
-            the size. Not available inside transformations.
-        max_source_points: match at most so many points of the source, at least 4, in every phase. The rows are cut into
-            so many runs of equal length, and one random row of each is used (with a fixed seed). After voxel averaging
-            these rows cover space evenly; otherwise they follow the density of the points. Neighbours (among all
-            points), covariances, estimated parameters, `num_inliers`, `overlap` and the covariance of the pose are of
-            these rows alone, and the pose has a derivative by them and their neighbours. The target stays complete.
-            None: all points. 10,000 nearly give the pose of all.
-        soft_matches: whether the derivative of the pose is that of soft matches. The pose, its status and all else are
-            those of the nearest matches in either case. The derivative is that of the root of `estimate_pose` near the
-            pose, over the 8 target points nearest to each source point in position and α · channel, within the fine
-            `max_distance`, with a `temperature` of one spacing of the target (its median nearest-neighbour distance,
-            or the edge of its cells). It approximates the change of the whole registration over steps that move
-            α · channel by about one spacing, but is not the slope over tiny steps, which change no match. That one is
-            the derivative with False: by channels, mostly a hundred times too small, and of any sign. None: True for
-            methods and clouds with channels, but not with `photometric=True`.
+        voxel_sizes: voxel sizes in metres, coarse to fine, for multi-scale registration; not inside transformations.
+            Each scale starts from the pose of the previous one with the default `max_distance`; a given one applies to
+            the final registration, at full resolution. For NDT these are cell sizes: the last one gives the result, and
+            at the others `GICP` registers voxels of a quarter of the size. Raw clouds have more points per cell than
+            preprocessed ones.
+        max_source_points: match at most so many points of the source, at least 4, in every phase: one random row, with
+            a fixed seed, from each of so many runs of equal length. After voxel averaging these rows cover space
+            evenly; otherwise they follow the density of the points. Neighbours are among all points, and all of the
+            target is used, but covariances, estimated parameters, `num_inliers`, `overlap`, the covariance of the pose
+            and its derivative are of these rows alone. None: all points. 10,000 nearly give the pose of all.
+        soft_matches: whether the derivative of the pose is that of soft matches, not that of the pose at fixed ones,
+            which is far too small by channels. The pose itself is the same. None: True for methods and clouds with
+            channels, but not with `photometric=True`.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
             target's axes. n may be 1 or 2. They do not replace a good initial pose.
         prior: (pose, covariance): a measurement of T_target_source, as by GNSS or an IMU, `jaxlie.SE3` or (4, 4), and
-            its covariance (6, 6), metres and radians, of ξ = (v, ω) in T = pose · exp(ξ): in the order and frame of
-            `RegistrationResult.covariance`. ξ is expressed at the origin and in the axes of the source. A GNSS
-            covariance Σ in the target's axes becomes Rᵀ Σ R. At UTM coordinates, that of a pose measured at the cloud
-            must be transported to their origin. Use a large finite variance for unmeasured directions. A variance of 0,
-            or any singular covariance, fixes directions, whatever the clouds say: with zeros for z, roll and pitch the
-            motion is planar. The prior is also the initial pose if `init` is None. Outside of `jit`, standard
-            deviations other than 0 count as at least 1.1e-5 (in float64 4.7e-10) radians, or 1.1e-5 of the largest
-            centred coordinate of the source.
-
-    With tie points or a prior, a first registration measures the covariance of the score of the matches. In it, tie
-    points and prior act only in directions that they know far more precisely than the matches do. A second one starts
-    at its pose and weighs matches, tie points and prior by their covariances (Hansen 1982, generalised method of
-    moments). It is the result; its `covariance` and `information` include tie points and prior. They also constrain
-    directions that the clouds do not (`UnconstrainedDirection.constrained_by_ties`). The pose is differentiable with
-    respect to points, pose and covariances; the weights of the matches are constants to autodiff. Contradictions are
-    averaged; a pose that contradicts the prior is UNVERIFIED. Inside transformations, covariances are not checked.
-
-    Fixed directions act from the first update on: ξ along them stays 0, the covariance is 0 up to rounding,
-    `directions.ties` are infinite, `information` leaves them out, and the clouds need not constrain them. A covariance
-    that `jit` or `vmap` traces must be positive definite. The derivative by the prior's pose leaves out the change of
-    the weights if other variances are finite.
+            its covariance (6, 6), metres and radians, of (v, ω) at the origin and in the axes of the source, as
+            `RegistrationResult.covariance`. A variance of 0 fixes a direction: with zeros for z, roll and pitch the
+            motion is planar.
 
     Returns:
         The pose with its status, quality of the fit and uncertainty; check `converged`.

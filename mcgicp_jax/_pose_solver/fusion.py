@@ -47,7 +47,7 @@ def constrained_by_pose_form(directions: Directions, information: Float[Array, "
 def fuse(
     pose: jaxlie.SE3, center: Float[Array, "3"], directions: Directions, moments: Moments, form: PoseForm
 ) -> Fusion:
-    """Equation of the pose from the end of a first registration, see `register`; `form` refers to pose and center."""
+    """Equation of the pose from the end of a first registration; `form` refers to pose and center."""
     radius = jnp.asarray(directions.radius)
     motion = Motion.of(pose.wxyz_xyz)
     measurements = PoseMeasurements(*motion, center, radius, form)

@@ -132,7 +132,7 @@ class RegistrationResult(eqx.Module):
             the scans is a sign of a wrong local minimum. In raw LiDAR scans many points have no match.
         history: arrays with one entry before each update and one at the returned pose: "cost", "rmse", "num_inliers",
             and the size of the update computed there: "translation_step" (metres, at the centroid of the matches) and
-            "rotation_step" (radians). In the coarse phase (see `register`) they cover the subsampled source. Inside a
+            "rotation_step" (radians). In the coarse phase they cover the subsampled source. Inside a
             transformation the length is `max_iterations` + 1, and unused entries are NaN.
         source_origin, target_origin: (3,) `PointCloud.origin` of both clouds, metres.
         centred: the pose between coordinates relative to these origins.
@@ -232,7 +232,7 @@ class RegistrationResult(eqx.Module):
     def jacobian(
         self, cloud: Literal["source", "target"], field: Literal["points", "channels", "covariances"] = "points"
     ) -> Float[np.ndarray, "6 N ..."]:
-        """Derivative of the pose by an array of a preprocessed cloud, as that of `register`: see there, `soft_matches`.
+        """Derivative of the pose by an array of a preprocessed cloud, as that of `register`; see `mcgicp_jax.guide`.
 
         Errors of the array with the covariance Σ cause the error J Σ Jᵀ of the pose.
 
