@@ -201,7 +201,7 @@ def test_padding_is_no_match():
 # Clouds
 
 
-@pytest.mark.parametrize("channels", [True, False])
+@pytest.mark.parametrize("channels", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_room_is_found_from_anywhere(channels):
     source, target, truth = rooms()
     clouds = (source, target) if channels else (bare(source), bare(target))
@@ -500,6 +500,7 @@ def test_a_lost_frame_is_found_in_the_map(against):
     assert pose_error(drifting[-1].pose, frames[2].pose @ np.linalg.inv(away))[0] > 0.5
 
 
+@pytest.mark.slow
 def test_the_command_line_starts_from_anywhere(tmp_path, capsys):
     names = [str(tmp_path / name) for name in ("source.npz", "target.npz", "pose.txt")]
     command = ["register", *names[:2], "--method", "gicp", "--init", "global", "--output", names[2]]

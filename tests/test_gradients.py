@@ -379,7 +379,7 @@ def test_tie_points_and_priors_have_gradients(clouds):
     check_eager_gradient(loss, jax.tree.map(jnp.asarray, inputs))
 
 
-@pytest.mark.parametrize("soft_matches", [False, None])
+@pytest.mark.parametrize("soft_matches", [pytest.param(False, marks=pytest.mark.slow), None])
 def test_gains_of_equalized_channels_are_constants_of_which_gradients_warn(soft_matches, clouds):
     """Another offset changes no gradient, and twice the contrast makes it half as large."""
     source, target = clouds
@@ -512,7 +512,7 @@ def two_blocks(precision):
     return pair(size=2500, noise=0.03)
 
 
-@pytest.mark.parametrize("soft", [False, None])
+@pytest.mark.parametrize("soft", [pytest.param(False, marks=pytest.mark.slow), None])
 def test_another_size_compiles_nothing(soft, two_blocks):
     """But for a copy of each of the two arguments, which `jax.grad` itself makes."""
 
@@ -542,7 +542,13 @@ def test_gradient_over_several_blocks_of_rows(two_blocks):
     check_eager_gradient(loss, {"source points": source.points, "target channels": target.channels})
 
 
-@pytest.mark.parametrize("options", [{}, {"max_source_points": 250}], ids=["all points", "some points"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, id="all points"),
+        pytest.param({"max_source_points": 250}, id="some points", marks=pytest.mark.slow),
+    ],
+)
 def test_a_ragged_batch_has_the_gradients_of_its_pairs(options):
     sources, targets, _ = zip(*(pair(size=size) for size in (300, 500, 2100)), strict=True)
     options = {"max_distance": GATE, **options}

@@ -102,6 +102,11 @@ def test_order_and_padding_of_the_points_do_not_matter():
     np.testing.assert_allclose(one.channels, other.channels, atol=1e-5)
 
 
+def test_of_too_many_voxels_no_row_is_valid():
+    assert not np.any(jax.jit(partial(averaged, size=100))(*surface()).valid)
+
+
+@pytest.mark.slow
 def test_too_many_voxels_show_in_the_status():
     points, channels = surface()
 
