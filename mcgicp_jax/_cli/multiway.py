@@ -62,18 +62,21 @@ def multiway(
 
     edges, rejected = result.graph.edges, int((~np.asarray(result.graph.kept)).sum())
     print(f"pairs:     {len(result.registrations)} registered, {len(edges)} with a result, {rejected} of them rejected")
-    print(f"chi²:      {result.graph.chi_squared:.3g} per redundant number (1: as the covariances predict)")
+    fit = f"{result.graph.chi_squared:.3g} per redundant number (1: as the covariances predict)"
+    print(f"chi²:      {fit if np.isfinite(result.graph.chi_squared) else 'unknown, since no number is redundant'}")
     deviations = np.sqrt(np.diagonal(np.asarray(result.graph.covariance), 0, 1, 2))
     millimetres, degrees = 1e3 * deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
     print(f"poses:     {result.graph.status.name}, at most {millimetres:.1f} mm and {degrees:.3f} deg uncertain")
 
     if output is not None:
         io.write_poses(output, result.poses)
+        print(f"poses:     {output}")
     if map is not None:
         io.write(map, result.map)
         print(f"map:       {map}, {len(result.map):,} points")
     if graph is not None:
         io.write_g2o(graph, result.graph)
+        print(f"graph:     {graph}")
     if plot is not None:
         plots.graph(result.graph, path=plot)
         print(f"picture:   {plot}")
@@ -88,6 +91,6 @@ def multiway(
         why = f"{status.name}, its pose contradicts the others or is not known"
         found = {registration.status.name for pair, registration in result.registrations.items() if i in pair}
         if status == mcg.Status.TOO_FEW_CORRESPONDENCES and found:
-            why = f"no registration holds its pose (statuses: {', '.join(sorted(found))})"
+            why = f"no registration holds its pose ({', '.join(sorted(found))})"
         print(f"mcgicp: {path}: {why}", file=sys.stderr)
     return 0 if result.converged else 1

@@ -166,8 +166,9 @@ def odometry(
 
     if failure:
         print(f"mcgicp: {failure}; stopped after {len(poses)} of {len(frames)} frames", file=sys.stderr)
-    if failed := sum(not result.converged for result in results):
-        print(f"mcgicp: {failed} of {len(results)} registrations did not converge", file=sys.stderr)
+    if failed := [result.status.name for result in results if not result.converged]:
+        statuses = ", ".join(sorted(set(failed)))
+        print(f"mcgicp: {len(failed)} of {len(results)} registrations did not converge ({statuses})", file=sys.stderr)
     return 1 if failed or failure else 0
 
 
