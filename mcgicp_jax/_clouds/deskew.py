@@ -7,8 +7,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
+from mcgicp_jax._clouds.rays_without_return import measured_rows
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal

@@ -17,7 +17,7 @@ from mcgicp_jax._clouds.columns import COLORS, arrays_of
 from mcgicp_jax._clouds.depth_images import back_project
 from mcgicp_jax._compute.concrete import DeferredRows, is_concrete
 from mcgicp_jax._compute.messages import messages_named
-from mcgicp_jax._compute.programs import size_class
+from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
 

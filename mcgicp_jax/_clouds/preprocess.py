@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from mcgicp_jax._clouds.coordinate_steps import harmful_steps
-from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Values, Voxels, as_cloud, is_far
 from mcgicp_jax._clouds.preprocess_inside_jit import preprocess_traced
+from mcgicp_jax._clouds.rays_without_return import measured_rows
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_and_grids, warn_of_shape
 from mcgicp_jax._clouds.voxels import Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
@@ -20,7 +20,7 @@ from mcgicp_jax._compute.linear_maps import RowAverage, primal, with_derivative
 from mcgicp_jax._compute.messages import check_concrete, check_integer, check_positive, warn
 from mcgicp_jax._math.statistics import median, sampled_rows
 from mcgicp_jax._search.base import AbstractSearch
-from mcgicp_jax._search.brute_force import default_search
+from mcgicp_jax._search.default_search import default_search
 
 # Fewest finite points of a cloud: the fewest that are not always coplanar.
 MIN_POINTS = 4

@@ -15,7 +15,7 @@ from mcgicp_jax._clouds.voxels import TURN, VARIATION
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints
-from mcgicp_jax._search.brute_force import default_search
+from mcgicp_jax._search.default_search import default_search
 
 
 @with_settings_of_package

@@ -15,8 +15,8 @@ from typing import Any, Literal, NamedTuple, TypeAlias, cast
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mcgicp_jax._clouds.placeholders import measured_rows
 from mcgicp_jax._clouds.point_cloud import PLANAR_ADVICE, PointCloud, Voxels
+from mcgicp_jax._clouds.rays_without_return import measured_rows
 from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal

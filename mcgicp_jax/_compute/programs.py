@@ -1,4 +1,4 @@
-"""How programs are compiled: in half the time, for few sizes, and with calls of the host."""
+"""How programs are compiled: in half the time, and with calls of the host."""
 
 from __future__ import annotations
 
@@ -72,18 +72,6 @@ def _known(options: tuple[tuple[str, bool | int], ...]) -> dict[str, bool | int]
     except Exception:
         return {}
     return known
-
-
-# Rows. Clouds of 100 to 200,000 points then fall into 23 classes, each compiled once, and brute force takes at most
-# 2.25 times as long for a padded cloud. With powers of two alone, it would take up to 4 times as long.
-_SMALLEST_CLASS = 128
-
-
-def size_class(count: int) -> int:
-    """The smallest of 128, 192, 256, 384, 512, ... that is at least `count`."""
-    count = max(count, _SMALLEST_CLASS)
-    power = 1 << (count - 1).bit_length()
-    return 3 * power // 4 if count <= 3 * power // 4 else power
 
 
 # Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB.

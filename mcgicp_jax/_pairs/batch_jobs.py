@@ -49,7 +49,8 @@ from mcgicp_jax._registration.register_pair import (
 )
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unknown_uncertainty, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, checked_measurements
-from mcgicp_jax._search.brute_force import DenseSearch, default_search
+from mcgicp_jax._search.brute_force import DenseSearch
+from mcgicp_jax._search.default_search import default_search
 
 # Number of pairs whose neighbourhoods are looked at, for warnings, where a device or a worker finds the neighbours: of
 # 6.1 ms in which the host prepared a pair of 2,000 points, this took 4.7, and the pairs of a batch are mostly alike.

@@ -23,7 +23,7 @@ from mcgicp_jax._compute.programs import call_host
 from mcgicp_jax._math.poses import logarithm_derivative, skew
 from mcgicp_jax._pose_graph.edge import WORLD, Edge, Factors, check_rows, motion_jacobians
 from mcgicp_jax._pose_graph.levenberg_marquardt import GraphState, factored, typical_information
-from mcgicp_jax._pose_graph.solver import GraphPoses, covariances_at, solve
+from mcgicp_jax._pose_graph.robust_solver import GraphPoses, covariances_at, solve
 from mcgicp_jax._registration.result import Status
 
 # Step of the central differences of `logarithm_derivative`, metres or radians: errors are of the order of 1e-10.

@@ -17,7 +17,7 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.implicit_derivative import covariances_traced, solve_traced
-from mcgicp_jax._pose_graph.solver import solve, uncertainty
+from mcgicp_jax._pose_graph.robust_solver import solve, uncertainty
 from mcgicp_jax._registration.result import Status
 
 

@@ -23,7 +23,7 @@ from mcgicp_jax._methods.surfaces import search_numbers, search_rows, searchable
 from mcgicp_jax._pose_solver.matched import Motion, distances_within
 from mcgicp_jax._registration.input_checks import check_clouds
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
-from mcgicp_jax._search.brute_force import default_search
+from mcgicp_jax._search.default_search import default_search
 
 
 @with_settings_of_package

@@ -67,7 +67,7 @@ from mcgicp_jax._registration.tie_points_and_prior import (
 )
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
-from mcgicp_jax._search.brute_force import default_search
+from mcgicp_jax._search.default_search import default_search
 
 # Smallest number of source points in a subsampled coarse phase: enough for nearly the pose of all points.
 _COARSE_ROWS = 4096

@@ -1,4 +1,4 @@
-"""Brute-force nearest-neighbour search in XLA, for accelerators; and the default search of each platform."""
+"""Brute-force nearest-neighbour search in XLA, for accelerators."""
 
 from __future__ import annotations
 
@@ -14,10 +14,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.devices import on_accelerator
-from mcgicp_jax._compute.programs import size_class
+from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
-from mcgicp_jax._search.kd_tree import KDTreeSearch
 
 # Coordinates and descriptors of rows, each with its penalties.
 Coordinates: TypeAlias = list[tuple[Array, Array | None]]
@@ -28,10 +26,6 @@ _RUN = 16
 _GROUP = 4
 # Distances to runs that are stored at a time: 64 MB in float32, those of all queries of clouds of 16,384 rows.
 _STORED = 2**24
-
-
-def default_search(traced: bool = False, workers: int = -1) -> AbstractSearch:
-    return DenseSearch() if traced and on_accelerator() else KDTreeSearch(workers)
 
 
 class DenseSearch(AbstractSearch):

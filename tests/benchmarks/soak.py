@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 import mcgicp_jax as mcg
-from mcgicp_jax._compute.programs import size_class
+from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._search import kd_tree as _trees
 from tests.scenes import room_corner
 
