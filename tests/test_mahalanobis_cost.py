@@ -426,3 +426,6 @@ def test_the_determinant_keeps_learned_covariances_from_growing(noisy):
     assert likelihood[0] < 0 < likelihood[-1]
     of_plane = np.eye(4), source, target, matches, PointToPlane()
     refused(lambda: mahalanobis_cost(*of_plane, log_determinant=True), "log_determinant", "PointToPlane")
+    # M of a residual of rank 1 has no determinant.
+    photometric = *of_plane[:4], MultiChannelGICP(photometric=True)
+    refused(lambda: mahalanobis_cost(*photometric, log_determinant=True), "log_determinant", "photometric=True")

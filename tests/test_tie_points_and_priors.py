@@ -97,6 +97,22 @@ def test_precise_tie_points_decide(corner):
     assert result.converged and result.deviations.max() < 1e-5
 
 
+def test_a_precise_prior_has_the_same_effect_and_checks_where_points_are_differentiated(corner):
+    """In float32, the inverse of such a covariance is rounded by far more than the least variances."""
+    source, target, truth = corner
+    variances = np.square([1e-4, 1e-3, 1e-7, 1e-9, 1e-2, 1e-8])
+
+    def pose(points, covariance):
+        prior = truth @ motion((0.01, 0, 0, 0, 0, 0.003)), covariance
+        return mcg.register(source.replace(points=points), target, mcg.GICP(), prior=prior, **OPTIONS).matrix
+
+    points = jnp.asarray(source.points)
+    value, _ = jax.vjp(lambda points: pose(points, np.diag(variances)), points)
+    np.testing.assert_allclose(value, pose(source.points, np.diag(variances)), atol=1e-6)
+    skewed = np.diag(variances) + 1e-4 * np.eye(6, k=1)
+    refused(lambda: jax.vjp(lambda points: pose(points, skewed), points), "prior: covariance", "not symmetric")
+
+
 @pytest.mark.parametrize(
     "method", [mcg.GICP(), mcg.PointToPlane(), mcg.D2DNDT()], ids=["gicp", "point-to-plane", "d2d-ndt"]
 )

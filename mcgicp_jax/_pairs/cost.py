@@ -20,6 +20,7 @@ from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.poses import Pose
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, with_unset_from
+from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.surfaces import differentiable_inputs, surface_pair
 from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, linearize_at, matched_rows, sample_of_term
 from mcgicp_jax._registration.input_checks import check_matches, warn_of_estimated_parameters
@@ -40,7 +41,8 @@ def mahalanobis_cost(
     log_determinant: bool = False,
 ) -> Float[Array, ""]:
     """Compute the cost F(T) = Σ ρ(dᵀ M d) of given matches, with d = b − T a and M = (C^B + R C^A Rᵀ)⁻¹ (Servos &
-    Waslander 2014, eq. 3, which omits the inverse); M = I or n nᵀ for the methods without covariances.
+    Waslander 2014, eq. 3, which omits the inverse). M is (C^B)⁻¹ for `NDT` and `ColorNDT`, and I or n nᵀ for
+    `PointToPoint`, `PointToPlane` and `ColorICP`.
 
     Differentiable with respect to all inputs but the matches, also inside `jit` and `vmap`. Outside of these, the cost
     and its gradient compile nothing for another size of clouds, and second derivatives raise `NotImplementedError`.
@@ -53,14 +55,15 @@ def mahalanobis_cost(
         source, target: preprocessed clouds.
         matches: from `find_correspondences`.
         method: defines M; parameters left None are estimated from the clouds, as constants to autodiff.
-        robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`; without any, ρ(s²) = s².
+        robust: kernel ρ applied to the Mahalanobis distance of each match, as in `register`. None: that of the method,
+            such as `Welsch` of `NDT`, or else ρ(s²) = s².
         temperature: metres. Weighs the candidates of each source point (`num_candidates`) by a softmax of
             −½ (distance / temperature)², with distances in position and α · channel; this gives α a gradient. As it
             tends to 0, only the nearest candidate counts. Required if there are several candidates, except for methods
             that sum over them (`D2DNDT`).
         log_determinant: add Σ log det (C^B + R C^A Rᵀ), which makes F (for squared distances) twice a Gaussian negative
             log-likelihood. Without it, a loss that learns covariances (or ε, or Λ) falls as these are inflated. For
-            `GICP` and `MultiChannelGICP`.
+            `GICP`, `D2DNDT`, and `MultiChannelGICP` without `photometric`.
 
     Returns:
         F, a scalar; in metres² for dimensionless covariances such as GICP's.
@@ -68,11 +71,13 @@ def mahalanobis_cost(
     Raises:
         ValueError: if `pose` is not a rigid motion, the shape of `matches` does not fit the source, `temperature` is
             missing or not positive, a cloud lacks the neighbours that the method needs, or `log_determinant` is set for
-            a method without covariances.
+            another method.
     """
     check_matches(matches, source, target, method, temperature)
-    if log_determinant and not isinstance(method, AbstractGeneralized):
-        raise ValueError(f"log_determinant: expected a method with covariances, got {type(method).__name__}")
+    photometric = isinstance(method, MultiChannelGICP) and method.photometric
+    if log_determinant and (photometric or not isinstance(method, AbstractGeneralized)):
+        name = type(method).__name__ + "(photometric=True)" * photometric
+        raise ValueError(f"log_determinant: expected a method that weighs distances by covariances, got {name}")
     warn_of_estimated_parameters(method, source, target, soft=temperature is not None)
     matrix, dtype = centred_pose(pose, source, target, "pose"), source.points.dtype
     motion = Motion(matrix[:3, :3].astype(dtype), matrix[:3, 3].astype(dtype))

@@ -55,9 +55,9 @@ def register(
     """Register two clouds: find matches at the current pose, update the pose, and repeat until it converges.
 
     A coarse phase, with the larger `max_distance` and an even subset of large clouds, is followed by a fine phase with
-    all points and the smaller one. Outside transformations, a pose that may have left a right `init` is checked by a
-    second registration. Works under `jit`, `vmap`, `grad` and `jvp`. `help(mcgicp_jax.guide)` explains the phases, this
-    check, the derivative of the pose, tie points and priors.
+    all points and the smaller one. Outside `jit` and `vmap`, a pose that may have left a right `init` is compared with
+    that of a second registration. Works under `jit`, `vmap`, `grad` and `jvp`. `help(mcgicp_jax.guide)` explains the
+    phases, this comparison, the derivative of the pose, tie points and priors.
 
     Args:
         source, target: clouds from `preprocess`. Raw clouds and (N, 3) arrays, metres, are preprocessed with the
@@ -66,23 +66,23 @@ def register(
             `voxel_gaussians` or with `voxel_sizes`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are
             estimated.
         init: initial T_target_source, `jaxlie.SE3` or (4, 4); None: the pose of the `prior`, or the identity. "global":
-            the pose found by `global_pose`, not inside transformations. If it does not succeed, the status is
+            the pose found by `global_pose`, not inside `jit`. If it does not succeed, the status is
             UNVERIFIED, or if it finds no pose at all, TOO_FEW_CORRESPONDENCES, and the pose NaN.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. Two numbers,
             for the coarse and for the fine phase, or one for both: points without a partner then pull the pose. None:
             10 and 2.5 times the spacing of the target (its median nearest-neighbour distance, or the edge of its
             cells); the first is also at least 10 times the spacing of a square grid of the target's density, as the
-            lines of LiDAR scans are far apart. Pass a larger first one if `init` is further off. With "global" and with
-            a prior, it is at most a voxel of `global_pose`, or three standard deviations of the prior beside the
-            distance from its pose to `init`.
+            lines of LiDAR scans are far apart. Pass a larger first one if `init` is further off. From a global pose
+            that succeeds, it is at most a voxel of `global_pose`, and with a prior, three standard deviations of this
+            beside the distance from its pose to `init`.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
             In float32, updates below some 1e-7 are rounding: smaller tolerances need float64.
         robust: kernel applied to the Mahalanobis distance of each match: `Huber`, `Cauchy`, `GemanMcClure`, `Tukey` or
-            `Welsch`. None: the kernel of the method (NDT: `Welsch`), if it has any. In the coarse phase its scale is
-            multiplied by the ratio of the two `max_distance`. With `photometric=True` the kernel is applied to each
-            residual in standard deviations, in the fine phase.
+            `Welsch`. None: the kernel of the method (NDT: `Welsch`), if it has any. In the coarse phase the scale of a
+            given one is multiplied by the ratio of the two `max_distance`. With `photometric=True` the kernel is
+            applied to each residual in standard deviations, in the fine phase.
         search: nearest-neighbour search; by default `KDTreeSearch`, and inside `jit` or `vmap` on accelerators
             `DenseSearch`.
         hold_unconstrained: if True, the pose is not updated along directions that neither the shape of the clouds nor
@@ -91,8 +91,8 @@ def register(
         equalize_channels: scale and shift each channel of the source to the distribution of the target's, for scans
             with different exposure or gain. A first registration uses the distributions of all points, and a second
             one from its pose those of matched points. With `MultiChannelGICP(photometric=True)`, gains and offsets are
-            instead estimated from interpolated channels, together with the pose.
-        voxel_sizes: voxel sizes in metres, coarse to fine, for multi-scale registration; not inside transformations.
+            estimated from interpolated channels, together with the pose, in place of the second one.
+        voxel_sizes: voxel sizes in metres, coarse to fine, for multi-scale registration; not inside `jit`.
             Each scale starts from the pose of the previous one with the default `max_distance`; a given one applies to
             the final registration, at full resolution. For NDT these are cell sizes: the last one gives the result, and
             at the others `GICP` registers voxels of a quarter of the size. Raw clouds have more points per cell than
@@ -100,8 +100,9 @@ def register(
         max_source_points: match at most so many points of the source, at least 4, in every phase: one random row, with
             a fixed seed, from each of so many runs of equal length. After voxel averaging these rows cover space
             evenly; otherwise they follow the density of the points. Neighbours are among all points, and all of the
-            target is used, but covariances, estimated parameters, `num_inliers`, `overlap`, the covariance of the pose
-            and its derivative are of these rows alone. None: all points. 10,000 nearly give the pose of all.
+            target is used, but covariances, estimated parameters, `num_inliers`, `overlap` and the covariance of the
+            pose are of these rows alone, and its derivative is by them and their neighbours. None: all points. 10,000
+            nearly give the pose of all.
         soft_matches: whether the derivative of the pose is that of soft matches, not that of the pose at fixed ones,
             which is far too small by channels. The pose itself is the same. None: True for methods and clouds with
             channels, but not with `photometric=True`.
@@ -118,8 +119,9 @@ def register(
 
     Raises:
         ValueError: if an argument is malformed, for instance in shape or dtype, channels that are used differ in number
-            or name, a cloud has fewer than four finite points, or `init` is not a rigid motion. The message names the
-            argument. Failures to register well-formed clouds show in `RegistrationResult.status`.
+            or name, a cloud has fewer than four finite points, or `init` is not a rigid motion; or for
+            `hold_unconstrained=False` with tie points or a prior. The message names the argument. Failures to register
+            well-formed clouds show in `RegistrationResult.status`.
 
     Warns:
         UserWarning: if points with NaN or infinity are left out; `MultiChannelGICP` gets clouds without channels; the

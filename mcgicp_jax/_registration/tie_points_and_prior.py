@@ -72,8 +72,10 @@ def _centred_prior(prior: GivenPrior, source: PointCloud, target: PointCloud) ->
     pose, covariance = _parts("prior", prior, "(pose, covariance)", 2)
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
-    if is_concrete(covariance, source.points, source.origin):
-        return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, source))
+    # Where the points are differentiated, too, so that the pose is the same.
+    cloud = primal(source)
+    if is_concrete(covariance, cloud.points, source.origin):
+        return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, cloud))
     fixed, value = None, primal(covariance)
     if is_concrete(value):
         values, rows = _principal_rows(np.asarray(value, np.float64))
