@@ -27,13 +27,15 @@ or if views have little in common and the other registration fails or ends elsew
 and a warning says which `max_distance` led to which pose. Where surfaces coincide about as well, a nearer pose replaces
 a DEGENERATE one, and a converged pose one after MAX_ITERATIONS.
 
-Inside `jit` and `vmap` nothing is compared: pass a small `max_distance` if `init` is near.
+Inside `jit` and `vmap` nothing is compared, so that a pose may be CONVERGED and wrong that is UNVERIFIED outside: pass
+a small `max_distance` if `init` is near.
 
 ## Outside and inside `jit`
 
 Outside `jit` and `vmap`, also inside `grad` or `jvp`, the loop runs on the host. It calls compiled programs whose
 shapes do not depend on the sizes of the clouds, so that another size compiles nothing. Value and gradient take as long
-as two to five registrations. `register_batch` differentiates many pairs in one call.
+as two to five registrations, of small clouds with channels up to eight. `register_batch` differentiates many pairs in
+one call.
 
 Inside `jit`, a registration is one program for each size of clouds, which compiles for 8 to 30 s: pad clouds to one
 size by `PointCloud.pad`. Matches come from host callbacks, one batch element at a time, or with `DenseSearch` from XLA.
@@ -83,8 +85,8 @@ except inside `jit` and where the covariance is differentiated. There, it is not
 
 A variance of 0, or any singular covariance, fixes directions, whatever the clouds say: the initial pose is moved onto
 them, ξ along them stays 0, the covariance is 0 up to rounding, `directions.ties` are infinite, `information` has
-nothing of the prior along them, and the clouds need not constrain them. A covariance that `jit` or `vmap` traces must
-be positive definite.
+nothing of the prior along them, and the clouds need not constrain them. Inside `jit`, give such a covariance as a NumPy
+array: one of `jnp`, which is traced there, must be positive definite and not too uneven, or the status is NON_FINITE.
 
 The pose is differentiable by the points of the tie points, the pose of the prior, and covariances other than 0. The
 weights of the matches are constants to autodiff. Where some directions are fixed, the derivative by the pose of the

@@ -66,7 +66,9 @@ def multiway(
     print(f"chi²:      {fit if np.isfinite(result.graph.chi_squared) else 'unknown, since no number is redundant'}")
     deviations = np.sqrt(np.diagonal(np.asarray(result.graph.covariance), 0, 1, 2))
     millimetres, degrees = 1e3 * deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
-    print(f"poses:     {result.graph.status.name}, at most {millimetres:.1f} mm and {degrees:.3f} deg uncertain")
+    known = np.isfinite(millimetres) and np.isfinite(degrees)
+    uncertainty = f"at most {millimetres:.1f} mm and {degrees:.3f} deg uncertain" if known else "some of them unknown"
+    print(f"poses:     {result.graph.status.name}, {uncertainty}")
 
     if output is not None:
         io.write_poses(output, result.poses)

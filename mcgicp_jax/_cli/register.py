@@ -158,7 +158,8 @@ def register(
 
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {_words(result)} after {result.num_iterations} iteration{plural}")
-    print(f"inliers:   {result.num_inliers:,} ({result.overlap:.0%} of the points used), rmse {result.rmse:.4g} m")
+    rmse = f", rmse {result.rmse:.4g} m" if result.num_inliers else ""
+    print(f"inliers:   {result.num_inliers:,} ({result.overlap:.0%} of the points used){rmse}")
     if result.converged and np.all(np.isfinite(result.deviations)):
         x, y, z, *angles = result.deviations
         roll, pitch, yaw = np.degrees(angles)

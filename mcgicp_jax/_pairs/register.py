@@ -69,12 +69,13 @@ def register(
             the pose found by `global_pose`, not inside `jit`. If it does not succeed, the status is
             UNVERIFIED, or if it finds no pose at all, TOO_FEW_CORRESPONDENCES, and the pose NaN.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. Two numbers,
-            for the coarse and for the fine phase, or one for both: points without a partner then pull the pose. None:
+            for the coarse and for the fine phase, or one for both: if it is large, points without a partner pull the
+            pose. None:
             10 and 2.5 times the spacing of the target (its median nearest-neighbour distance, or the edge of its
             cells); the first is also at least 10 times the spacing of a square grid of the target's density, as the
-            lines of LiDAR scans are far apart. Pass a larger first one if `init` is further off. From a global pose
-            that succeeds, it is at most a voxel of `global_pose`, and with a prior, three standard deviations of this
-            beside the distance from its pose to `init`.
+            lines of LiDAR scans are far apart. Pass a larger first one if `init` is further off. This
+            default of the first is at most a voxel of a global pose that succeeds, and with a prior at most three
+            standard deviations of this plus the distance from its pose to `init`.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.
@@ -97,14 +98,14 @@ def register(
             the final registration, at full resolution. For NDT these are cell sizes: the last one gives the result, and
             at the others `GICP` registers voxels of a quarter of the size. Raw clouds have more points per cell than
             preprocessed ones.
-        max_source_points: match at most so many points of the source, at least 4, in every phase: one random row, with
-            a fixed seed, from each of so many runs of equal length. After voxel averaging these rows cover space
-            evenly; otherwise they follow the density of the points. Neighbours are among all points, and all of the
-            target is used, but covariances, estimated parameters, `num_inliers`, `overlap` and the covariance of the
-            pose are of these rows alone, and its derivative is by them and their neighbours. None: all points. 10,000
-            nearly give the pose of all.
-        soft_matches: whether the derivative of the pose is that of soft matches, not that of the pose at fixed ones,
-            which is far too small by channels. The pose itself is the same. None: True for methods and clouds with
+        max_source_points: match at most so many points of the source, at least 4, in every phase. The rows are cut into
+            that many runs, and one random row of each is used, with a fixed seed. After voxel averaging these rows
+            cover space evenly; otherwise they follow the density of the points. Neighbours are among all points, and
+            all of the target is used, but covariances, estimated parameters, `num_inliers`, `overlap` and the
+            covariance of the pose are of these rows alone, and its derivative is by them and their neighbours. None:
+            all points. 10,000 nearly give the pose of all.
+        soft_matches: whether the derivative of the pose, which is the same, is that of soft matches. With False matches
+            are constants, so that derivatives by channels are far too small. None: True for methods and clouds with
             channels, but not with `photometric=True`.
         tie_points: (source_points, target_points, covariances), metres: points (n, 3) known to be the same, such as
             surveyed targets or image features (Huhle & Jenke 2008), and the covariances (n, 3, 3) of b − T a, in the
@@ -130,8 +131,8 @@ def register(
             sensor (they are left out, or a pose that they alone hold is UNVERIFIED); extent and spacing of the clouds
             differ so much that their units of length probably differ; or `GICP` gets one cloud with covariances that
             are not dimensionless. Outside of `jit`: if the pose is UNVERIFIED, or `global_pose` finds none, why; if
-            channels or `channel_weights` are differentiated with `soft_matches=False`; or channels are while
-            `channel_covariance` or, unless it is False, `channel_weights` is None.
+            channels or `channel_weights` are differentiated with `soft_matches=False`; or if channels are
+            differentiated while Λ or α of the method is estimated from them.
     """
     options_of(register, unknown)
     check_method(method)
