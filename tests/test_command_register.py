@@ -171,6 +171,7 @@ def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
         assert main(["register", *arguments]) == 1
         text, errors = capsys.readouterr()
         assert "status: " in text and errors.startswith("mcgicp: ") and status in errors
+        assert "rmse nan" not in text
 
 
 @pytest.mark.slow
