@@ -72,16 +72,16 @@ channels are noise.
 With tie points or a prior, there are two stages. The first one measures the covariance of the score of the matches; tie
 points and prior act in it only along directions that they know far more precisely than the matches do. The second one
 starts at its pose, and weighs matches, tie points and prior by their covariances (Hansen 1982, generalised method of
-moments). It is the result, and its `covariance` and `information` include tie points and prior. They also
-constrain directions that the clouds do not (`UnconstrainedDirection.constrained_by_ties`). Where they contradict the
-matches, the pose is an average, and UNVERIFIED if it contradicts the prior.
+moments). It is the result, and its `covariance` and `information` include tie points and prior. They also constrain
+directions that the clouds do not (`UnconstrainedDirection.constrained_by_ties`). Where they contradict the matches, the
+pose is an average, and UNVERIFIED if it contradicts the prior.
 
 The covariance of a prior is that of ξ = (v, ω) in T = pose · exp(ξ), in the order and frame of
 `RegistrationResult.covariance`: ξ is expressed at the origin and in the axes of the source. So a GNSS covariance Σ in
 the target's axes becomes Rᵀ Σ R, and at UTM coordinates, the covariance of a pose measured at the cloud must be
 transported to their origin. Give directions that are not measured a large, finite variance. Standard deviations other
-than 0 count as at least 1.1e-5 radians (in float64 4.7e-10), or 1.1e-5 of the largest centred coordinate of the source,
-except inside `jit` and where the covariance is differentiated. There, it is not checked either.
+than 0 count as at least 1.1e-5 radians (in float64 4.7e-10), or 1.1e-5 of the largest centred coordinate of the source.
+Inside `jit`, and where the covariance is differentiated, they do not, and the covariance is not checked.
 
 A variance of 0, or any singular covariance, fixes directions, whatever the clouds say: the initial pose is moved onto
 them, ξ along them stays 0, the covariance is 0 up to rounding, `directions.ties` are infinite, `information` has

@@ -66,16 +66,15 @@ def register(
             `voxel_gaussians` or with `voxel_sizes`, `NDT()`, `ColorNDT(...)`, `D2DNDT()`. Parameters left None are
             estimated.
         init: initial T_target_source, `jaxlie.SE3` or (4, 4); None: the pose of the `prior`, or the identity. "global":
-            the pose found by `global_pose`, not inside `jit`. If it does not succeed, the status is
-            UNVERIFIED, or if it finds no pose at all, TOO_FEW_CORRESPONDENCES, and the pose NaN.
+            the pose found by `global_pose`, not inside `jit`. If it does not succeed, the status is UNVERIFIED, or if
+            it finds no pose at all, TOO_FEW_CORRESPONDENCES, and the pose NaN.
         max_distance: maximum correspondence distance, metres of position; matches beyond it are rejected. Two numbers,
             for the coarse and for the fine phase, or one for both: if it is large, points without a partner pull the
-            pose. None:
-            10 and 2.5 times the spacing of the target (its median nearest-neighbour distance, or the edge of its
-            cells); the first is also at least 10 times the spacing of a square grid of the target's density, as the
-            lines of LiDAR scans are far apart. Pass a larger first one if `init` is further off. This
-            default of the first is at most a voxel of a global pose that succeeds, and with a prior at most three
-            standard deviations of this plus the distance from its pose to `init`.
+            pose. None: 10 and 2.5 times the spacing of the target (its median nearest-neighbour distance, or the edge
+            of its cells); the first is also at least 10 times the spacing of a square grid of the target's density, as
+            the lines of LiDAR scans are far apart. From a global pose that succeeds, the default of the first is at
+            most a voxel of `global_pose`, and with a prior, at most three of its standard deviations plus the distance
+            from its pose to `init`. Pass a larger first one if `init` is further off.
         max_iterations: maximum number of pose updates in both phases together.
         translation_tolerance, rotation_tolerance: metres (at the centroid of the matches) and radians; the loop has
             converged when an update is below both. `translation_tolerance` None: 0.5 % of the spacing of the target.

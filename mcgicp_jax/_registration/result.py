@@ -132,8 +132,8 @@ class RegistrationResult(eqx.Module):
             the scans is a sign of a wrong local minimum. In raw LiDAR scans many points have no match.
         history: arrays with one entry before each update and one at the returned pose: "cost", "rmse", "num_inliers",
             and the size of the update computed there: "translation_step" (metres, at the centroid of the matches) and
-            "rotation_step" (radians). In the coarse phase they cover the subsampled source. Inside a
-            transformation the length is `max_iterations` + 1, and unused entries are NaN.
+            "rotation_step" (radians). In the coarse phase they cover the subsampled source. Inside a transformation
+            the length is `max_iterations` + 1, and unused entries are NaN.
         source_origin, target_origin: (3,) `PointCloud.origin` of both clouds, metres.
         centred: the pose between coordinates relative to these origins.
         constraints, uncertainty: deferred values of `information` and `directions`, and of `covariance` and

@@ -72,7 +72,7 @@ def _centred_prior(prior: GivenPrior, source: PointCloud, target: PointCloud) ->
     pose, covariance = _parts("prior", prior, "(pose, covariance)", 2)
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
-    # Where the points are differentiated, too, so that the pose is the same.
+    # The points only scale the least deviations: while they are differentiated, their values suffice.
     cloud = primal(source)
     if is_concrete(covariance, cloud.points, source.origin):
         return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, cloud))
