@@ -45,6 +45,7 @@ Results
     RegistrationResult, Status      of a pair: pose, status, covariance
     GlobalPoseResult, OdometryStep, MultiwayResult, PoseGraphResult
                                     of the functions above
+    UnconstrainedDirection          a motion that the clouds leave open
     Correspondences                 matches
     PairWarning                     why a pair of a batch is invalid, or its pose doubtful
     metrics, plot                   errors of poses; pictures
@@ -77,6 +78,7 @@ from mcgicp_jax._pairs.register import register
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult, optimize_poses
+from mcgicp_jax._pose_solver.degeneracy import UnconstrainedDirection
 from mcgicp_jax._registration.correspondences import find_correspondences
 from mcgicp_jax._registration.result import RegistrationResult, Status
 from mcgicp_jax._search.base import AbstractSearch, Correspondences
@@ -116,6 +118,7 @@ __all__ = [
     "RegistrationResult",
     "Status",
     "Tukey",
+    "UnconstrainedDirection",
     "Welsch",
     "datasets",
     "deskew",

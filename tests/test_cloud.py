@@ -310,6 +310,9 @@ def test_repr_is_short_and_says_what_matters():
         inside = []
         jax.jit(lambda cloud, inside=inside: inside.append(repr(cloud)) or cloud.points)(cloud)
         assert str(len(cloud.points)) in inside[0]
+        # Leaves that are no arrays.
+        assert f"points=({len(cloud.points)}, 3)" in repr(jax.tree.map(np.shape, cloud))
+        assert "ShapeDtypeStruct" in repr(jax.eval_shape(lambda cloud: cloud, cloud))
 
 
 class Foreign:

@@ -65,14 +65,14 @@ def test_a_folder_is_registered_file_by_file(folder, tmp_path, capsys):
         (f"scan_{i + 1}.ply", f"scan_{i}.ply") for i in range(NUM_FILES - 1)
     ]
     for i, row in enumerate(rows):
-        assert row["status"] == "converged" and row["reason"] == ""
+        assert row["status"] == "CONVERGED" and row["reason"] == ""
         assert max(pose_error(matrix(row), np.linalg.inv(pose(i)) @ pose(i + 1))) < 0.03
         assert int(row["inliers"]) > 900
         assert np.float32(row["overlap"]) == np.float32(int(row["inliers"]) / 1000)
         deviations = [float(row[f"deviation_{axis}"]) for axis in ("x", "y", "z", "rx", "ry", "rz")]
         assert np.all(np.array(deviations) > 1e-5) and np.all(np.array(deviations) < 0.01)
     text = capsys.readouterr().out
-    assert f"{NUM_FILES - 1} converged" in text and "intensity" in text
+    assert f"{NUM_FILES - 1} CONVERGED" in text and "intensity" in text
 
 
 @pytest.mark.slow
@@ -92,7 +92,7 @@ def test_a_second_run_does_what_is_missing_or_could_not_be_registered(folder, tm
     command = ["batch", pairs, "--output", str(output), *OPTIONS]
     assert main(command) == 1
     before, first = table(output), "".join(output.read_text().splitlines(keepends=True)[:2])
-    assert [row["status"] for row in before] == ["converged", "invalid_input"]
+    assert [row["status"] for row in before] == ["CONVERGED", "INVALID_INPUT"]
     # As a process leaves it that is killed while it writes.
     output.write_text(first + "scan_1.ply,scan_2.p")
     capsys.readouterr()
@@ -103,7 +103,7 @@ def test_a_second_run_does_what_is_missing_or_could_not_be_registered(folder, tm
     assert main(command) == 0
     assert "2, of which 1 are in" in capsys.readouterr().out
     assert output.read_text().startswith(first)
-    assert [(row["source"], row["status"]) for row in table(output)] == [(name, "converged") for name in names[:2]]
+    assert [(row["source"], row["status"]) for row in table(output)] == [(name, "CONVERGED") for name in names[:2]]
     complete = output.read_text()
     assert main(command) == 0
     assert output.read_text() == complete
@@ -116,11 +116,11 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     pairs, output = write_pairs(folder / "bad.csv", lines, ("source", "target", *POSE)), tmp_path / "results.csv"
     assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1
     rows = {row["source"]: row for row in table(output)}
-    assert rows["scan_1.ply"]["status"] == "converged"
-    assert rows["scan_2.ply"]["status"] == "too_few_correspondences"
+    assert rows["scan_1.ply"]["status"] == "CONVERGED"
+    assert rows["scan_2.ply"]["status"] == "TOO_FEW_CORRESPONDENCES"
     assert "fewer than four points have a match" in rows["scan_2.ply"]["reason"]
     for name in ("missing.ply", "notes.txt"):
-        assert rows[name]["status"] == "invalid_input" and name in rows[name]["reason"]
+        assert rows[name]["status"] == "INVALID_INPUT" and name in rows[name]["reason"]
     text, errors = capsys.readouterr()
     assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors and "Errno" not in errors
     assert "done:      4 of 4, " in text and f"table:     {output}\n" in text
@@ -129,13 +129,17 @@ def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
     assert "done:      2 of 2\n" in capsys.readouterr().out
 
 
-def test_a_degenerate_pair_names_its_unconstrained_directions(tmp_path):
+def test_a_degenerate_pair_names_its_unconstrained_directions(tmp_path, capsys):
     for seed in range(2):
         noise = np.random.default_rng(seed).normal(size=(1000, 3))
         io.write(tmp_path / f"floor_{seed}.ply", mcg.PointCloud(noise * [1, 1, 0.01]))
-    assert main(["batch", str(tmp_path), "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 1
-    (row,) = table(tmp_path / "results.csv")
-    assert row["status"] == "degenerate" and row["reason"].startswith("unconstrained: translation along (")
+    output = tmp_path / "results.csv"
+    command = ["batch", str(tmp_path), "--output", str(output), *OPTIONS]
+    assert main(command) == 1
+    (row,) = table(output)
+    assert row["status"] == "DEGENERATE" and row["reason"].startswith("unconstrained: translation along (")
+    output.write_text(output.read_text().replace("DEGENERATE", "unknown"))
+    assert main(command) == 2 and "such as CONVERGED, got unknown" in capsys.readouterr().err
 
 
 def test_a_pair_from_several_starts(folder, tmp_path, capsys):
@@ -149,7 +153,7 @@ def test_a_pair_from_several_starts(folder, tmp_path, capsys):
         assert main(["batch", pairs, "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 1
         assert (f"of which {done}" in capsys.readouterr().out) == bool(done)
     statuses = [row["status"] for row in table(tmp_path / "results.csv")]
-    assert statuses == ["too_few_correspondences", "converged", "converged"]
+    assert statuses == ["TOO_FEW_CORRESPONDENCES", "CONVERGED", "CONVERGED"]
 
 
 def test_a_list_that_makes_no_sense(tmp_path, capsys):

@@ -42,9 +42,11 @@ def test_a_scene_is_followed_and_its_files_are_written(tmp_path, capsys):
 
 
 def test_what_does_not_converge_is_no_success(capsys):
-    assert main(["odometry", "box-room", "--num-frames", "2", "--method", "gicp", "--max-distance", "1e-6"]) == 1
+    command = ["odometry", "box-room", "--num-frames", "2", "--method", "gicp", "--max-distance", "1e-6"]
+    assert main(command) == 1
     text, errors = capsys.readouterr()
-    assert "pairs:     0 of 1 converged" in text
+    assert "pairs:     0 of 1 converged" in text and "matches up to 1e-06 m apart" in text
+    assert "lost:      1 of 2 frames" in text and ". --recover finds lost frames again" in errors
     first, second = errors.splitlines()
     assert first.startswith("mcgicp: frames[1]: TOO_FEW_CORRESPONDENCES")
     assert second == "mcgicp: 1 of 1 registrations did not converge (TOO_FEW_CORRESPONDENCES)"
@@ -81,6 +83,7 @@ def test_wrong_input_gets_one_line(tmp_path, capsys):
         ([str(alone)], f"mcgicp odometry 7-scenes {alone}"),
         # Options that contradict each other are named as flags.
         (["box-room", "--against", "map", "--loops"], "mcgicp: --loops: expected --against previous"),
+        (["box-room", "--recover", "--loops"], "registrations become edges, got --recover"),
         (["box-room", "--map-radius", "5"], "mcgicp: --map-radius: expected --against map"),
         (["box-room", "--deskew"], "mcgicp: --deskew: expected points with times"),
         (["box-room", "--deskew", "--every", "2"], "mcgicp: --deskew: expected scans that follow each other"),

@@ -113,7 +113,7 @@ def test_register_prints_the_pose(register, method):
     assert code == 0 and errors == ""
     # Points lie around the means of their cells.
     rmse = "rmse 0.1" if method == "ndt" else "rmse 0.0"
-    assert all(part in text for part in (method, "converged", "1,000", rmse))
+    assert all(part in text for part in (method, "CONVERGED", "1,000", rmse))
     assert close_to_truth(printed_matrix(text), factor=1 if "gicp" in method or "plane" in method else 4)
 
 
@@ -164,8 +164,8 @@ def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
     far = save(tmp_path / "far.npz", room_corner(1000)[0] + 100)
     flat = save(tmp_path / "flat.npz", np.random.default_rng(0).random((500, 3)) * [1, 1, 0])
     for arguments, status in (
-        ([far, files["target"], "--method", "gicp"], "too few correspondences"),
-        ([files["source"], files["target"], "--max-iterations", "1"], "max iterations"),
+        ([far, files["target"], "--method", "gicp"], "TOO_FEW_CORRESPONDENCES"),
+        ([files["source"], files["target"], "--max-iterations", "1"], "MAX_ITERATIONS"),
         ([flat, flat, "--method", "point-to-plane"], "unconstrained"),
     ):
         assert main(["register", *arguments]) == 1
@@ -178,7 +178,7 @@ def test_what_does_not_converge_is_no_success(files, tmp_path, capsys):
 def test_compare(files, capsys):
     assert main(["compare", files["source"], files["target"], "--truth", files["truth"]]) == 0
     lines = capsys.readouterr().out.splitlines()
-    rows = {line.split()[0]: line.split()[1:] for line in lines if line.endswith("converged")}
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line.endswith("CONVERGED")}
     assert list(rows) == list(METHODS)
     start = next(line.split() for line in lines if line.startswith("(start)"))
     middle = np.asarray(io.read(files["source"]).points).mean(axis=0)
@@ -190,7 +190,7 @@ def test_compare(files, capsys):
     text, errors = capsys.readouterr()
     assert "error" not in text and text.count("left out") == 4
     # Methods of one status share a line.
-    assert errors.count(": max iterations: ") == 1
+    assert errors.count(": MAX_ITERATIONS: ") == 1
 
 
 @pytest.mark.slow
@@ -202,7 +202,7 @@ def test_compare_leaves_out_methods_that_refuse_the_clouds(tmp_path, capsys):
     assert main(["compare", *names]) in (0, 1)
     lines = capsys.readouterr().out.splitlines()
     assert sum("left out: " in line and "4 cells of 6 points" in line for line in lines) == 3
-    assert any(line.startswith("gicp ") and line.endswith("converged") for line in lines)
+    assert any(line.startswith("gicp ") and line.endswith("CONVERGED") for line in lines)
 
 
 @pytest.mark.slow
@@ -328,6 +328,7 @@ def test_messages_have_options_of_the_command_line():
     for message, expected in (
         ('max_distance=(1, 0.2) or init="global"', "--max-distance 1 0.2 or --init global"),
         ("try another max_distance; use equalize_channels=True", "try another --max-distance; use --equalize-channels"),
+        ("recover=True finds lost frames again", "--recover finds lost frames again"),
         ("max_distance: expected columns=N", "--max-distance: expected --columns N"),
         *((text, text) for text in ("no channels in common", "/a/max_distance/b: cut", "max_distance.ply: cut")),
         *((text, text) for text in ("channels=3.npz: cut", "max_distance=(1, 0.2).npz: cut (at 3)", "columns=3: cut")),

@@ -51,7 +51,7 @@ _COLUMNS = ("source", "target", "init", "status", *_NUMBERS, "reason")
 # Exit code after Ctrl-C: 128 + SIGINT, as shells have it.
 _INTERRUPTED = 130
 # Statuses of pairs that could not be registered; a later run tries them again.
-_TRIED_AGAIN = ("invalid_input", "worker_failed")
+_TRIED_AGAIN = (mcg.Status.INVALID_INPUT.name, mcg.Status.WORKER_FAILED.name)
 
 
 @with_names
@@ -109,7 +109,7 @@ def batch(
     if interrupted:
         print("mcgicp: interrupted; run the same command again to continue", file=sys.stderr)
         return _INTERRUPTED
-    failed = counts.total() - counts[mcg.Status.CONVERGED.name.lower()]
+    failed = counts.total() - counts[mcg.Status.CONVERGED.name]
     if failed:
         print(f"mcgicp: {failed} of {len(wanted)} pairs did not converge; see {output}", file=sys.stderr)
     return 1 if failed else 0
@@ -174,6 +174,7 @@ def _registration(folder: Path, pairs: Iterable[Key], method: Method, options: O
         return choices.preprocess(names[0], source), choices.preprocess(names[1], target)
 
     resolved_method, arguments = choices.method(name, preprocessed), choices.arguments(name, preprocessed)
+    choices.print_method(name, arguments.get("max_distance", ()))
     arguments |= {"voxel_size": size, "num_neighbors": options.num_neighbors}
     read = partial(_read, choices.channels, options.columns)
 
@@ -264,7 +265,10 @@ def _read_rows(path: Path) -> list[Row]:
     reader = csv.DictReader(line for line in lines if line.endswith("\n"))
     if lines and tuple(reader.fieldnames or ()) != _COLUMNS:
         raise ValueError(f"{path}: expected a table of mcgicp batch, got the columns {reader.fieldnames}")
-    return list(reader)
+    rows = list(reader)
+    if unknown := {row["status"] for row in rows} - set(mcg.Status.__members__):
+        raise ValueError(f"{path}: expected statuses of mcgicp batch, such as CONVERGED, got {listed(sorted(unknown))}")
+    return rows
 
 
 def _write_rows(path: Path, rows: Iterable[Row]) -> None:
@@ -282,5 +286,5 @@ def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     if not reason and result.status is mcg.Status.DEGENERATE:
         reason = f"unconstrained: {as_text(result.unconstrained_directions)}"
     reason = with_flags(" ".join((reason or result.status.advice).split()))
-    texts = (*key, result.status.name.lower(), *map(repr, values), reason)
+    texts = (*key, result.status.name, *map(repr, values), reason)
     return dict(zip(_COLUMNS, texts, strict=True))

@@ -41,6 +41,11 @@ class Choices:
         self.print_channels("" if method or self.channels else " in common, therefore gicp")
         return name
 
+    def print_method(self, name: str, max_distance: float | tuple[float, ...] = ()) -> None:
+        """The method and its distances, metres, if these do not follow from the clouds."""
+        distances = " m, then ".join(f"{distance:g}" for distance in np.atleast_1d(max_distance))
+        print(f"method:    {name}{f', matches up to {distances} m apart' if distances else ''}")
+
     def print_channels(self, consequence: str = "") -> None:
         differ = not self.options.channels and len({cloud.channel_names for cloud in self.first_two.values()}) > 1
         details = f" ({self._channels_of_each()})" if differ else ""

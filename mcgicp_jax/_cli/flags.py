@@ -7,6 +7,9 @@ from collections.abc import Sequence
 
 from mcgicp_jax._cli.options import PairOptions
 
+# Arguments of Python that are options of commands, and may occur in messages.
+_OPTIONS = {*PairOptions.__dataclass_fields__, "recover"}
+
 
 def with_flags(message: str, args: Sequence[str] = ()) -> str:
     """The message with arguments of Python, such as max_distance=(1, 0.2), as options of the command line; also the
@@ -19,7 +22,7 @@ def with_flags(message: str, args: Sequence[str] = ()) -> str:
     def flag(match: re.Match[str]) -> str:
         name, value = match.groups("")
         # Some names are words, too.
-        if name not in PairOptions.__dataclass_fields__ or not (value or "_" in name):
+        if name not in _OPTIONS or not (value or "_" in name):
             return match[0]
         value = re.sub(r'[(),"]|True', "", value)
         return f"--{name.replace('_', '-')} {value}".rstrip()

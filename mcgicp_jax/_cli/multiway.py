@@ -58,6 +58,7 @@ def multiway(
     initial_poses = None if init is None else list(io.read_poses(init))
     arguments = choices.arguments(name, lambda: (clouds[1], clouds[0]))
     resolved_method = choices.method(name, lambda: (clouds[1], clouds[0]))
+    choices.print_method(name, arguments.get("max_distance", ()))
     result = mcg.multiway(clouds, resolved_method, init=initial_poses, voxel_size=voxels.size, **arguments)
 
     edges, rejected = result.graph.edges, int((~np.asarray(result.graph.kept)).sum())

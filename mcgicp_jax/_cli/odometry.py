@@ -61,6 +61,7 @@ def odometry(
     max_range: float = float("inf"),
     against: Literal["previous", "map"] = "previous",
     map_radius: Annotated[float | None, shown("FLOAT")] = None,
+    recover: bool = False,
     loops: bool = False,
     deskew: bool = False,
     output: File = None,
@@ -88,7 +89,8 @@ def odometry(
         max_range: Metres; points further from the sensor are left out.
         against: Register each frame to the one before it, or to a map of all frames before it, which drifts less.
         map_radius: Metres; points further from the sensor leave the map. By default the range of the first frame.
-        loops: Register frames with earlier ones that saw the same place, and correct all poses.
+        recover: Find frames again in the map of all frames before them where tracking is lost, as after a jump.
+        loops: Register frames with earlier ones that saw the same place, and correct all poses. Not with --recover.
         deskew: Undo the motion of the sensor during each scan, whose points have times; the street is simulated so.
         output: File for the poses, sensor to world.
         pose_format: kitti writes the upper three rows of each matrix on one line; tum writes time, position and
@@ -102,8 +104,9 @@ def odometry(
     check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)
     check_integer("every", every, 1)
-    if loops and against == "map":
-        raise ValueError("--loops: expected --against previous, whose registrations become edges, got --against map")
+    if loops and (against == "map" or recover):
+        other = "--against map" if against == "map" else "--recover"
+        raise ValueError(f"--loops: expected --against previous, whose registrations become edges, got {other}")
     if map_radius is not None and against != "map":
         raise ValueError(f"--map-radius: expected --against map with {map_radius:g}, got --against {against}")
     if shared.columns is not None and isinstance(dataset, str):
@@ -138,8 +141,9 @@ def odometry(
     options = choices.arguments(name, source_and_target)
     if isinstance(dataset, str):
         options.setdefault("max_distance", DATASETS[dataset].max_distance)
+    choices.print_method(name, options.get("max_distance", ()))
     options |= {"num_neighbors": shared.num_neighbors, "against": against, "map_radius": map_radius}
-    options |= {"loops": loops, "deskew": deskew, "start": first.pose}
+    options |= {"recover": recover, "loops": loops, "deskew": deskew, "start": first.pose}
     truth: list[Pose | None] = []
     times: list[Any] = []
 
@@ -215,7 +219,7 @@ def _follow(
     poses: list[Pose] = []
     results: list[mcg.RegistrationResult] = []
     clouds: list[mcg.PointCloud] = []
-    world, last, failure = None, None, ""
+    world, last, failure, num_lost = None, None, "", 0
     try:
         for step in tqdm(steps, total=len(frames), unit="frame", disable=None):
             # Loops change all poses until the end. Without loops, clouds go into the map at once, to save memory.
@@ -225,6 +229,7 @@ def _follow(
                 world = world or VoxelMap(map_voxel_size(step.cloud))
                 world.add(f"frame {len(poses)}", step.cloud, step.pose)
             poses.append(step.pose)
+            num_lost += step.lost
             if step.registration is not None:
                 results.append(step.registration)
             last = step
@@ -233,6 +238,8 @@ def _follow(
         if not poses:
             raise
         failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{frames.name(len(poses))}: {error}"
+    if num_lost:
+        print(f"lost:      {num_lost} of {len(poses)} frames, whose poses are not known")
     if loops and last is not None:
         graph: Any = last.graph
         print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")

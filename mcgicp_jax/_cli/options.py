@@ -221,7 +221,7 @@ def check_outputs(
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         if not path.parent.is_dir():
-            raise FileNotFoundError(errno.ENOENT, f"{os.strerror(errno.ENOENT)}: {path.parent}", str(path))
+            raise FileNotFoundError(errno.ENOENT, f"the folder {path.parent} does not exist", str(path))
     if cloud is not None:
         format_of(cloud)
     if picture is not None:

@@ -157,7 +157,7 @@ def register(
     result = pair.register(name, resolved_method)
 
     plural = "" if result.num_iterations == 1 else "s"
-    print(f"status:    {_words(result)} after {result.num_iterations} iteration{plural}")
+    print(f"status:    {result.status.name} after {result.num_iterations} iteration{plural}")
     rmse = f", rmse {result.rmse:.4g} m" if result.num_inliers else ""
     print(f"inliers:   {result.num_inliers:,} ({result.overlap:.0%} of the points used){rmse}")
     if result.converged and np.all(np.isfinite(result.deviations)):
@@ -216,7 +216,7 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
     names = tuple(METHODS) if all_methods else _DEMO
     _compare(source_file, target_file, options, truth_file, names)
     print(
-        "Geometry does not constrain motion along a flat wall: methods that use it alone report it (degenerate) and"
+        "Geometry does not constrain motion along a flat wall: methods that use it alone report it (DEGENERATE) and"
         "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
         f"\n{enumerated([name for name in names if METHODS[name].kind.uses_channels])} are constrained by the channels "
         "red, green and blue."
@@ -252,7 +252,7 @@ def _compare(
         values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
         if true_pose is not None:
             values = pair.errors(np.asarray(result.matrix), true_pose)
-        print(f"{name:{width}}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {_words(result)}")
+        print(f"{name:{width}}  {values}  {result.num_iterations:10}  {milliseconds:8.0f}  {result.status.name}")
     print("(times do not include compilation, preprocessing and the choice of parameters)\n")
     pair.draw(results)
     return results
@@ -282,10 +282,6 @@ def _compiled(pair: PreparedPair, names: Sequence[str]) -> tuple[dict[str, Abstr
     return methods, reasons
 
 
-def _words(result: mcg.RegistrationResult) -> str:
-    return result.status.name.lower().replace("_", " ")
-
-
 def _verdict(results: dict[str, mcg.RegistrationResult]) -> int:
     """Print to stderr which methods did not converge, and return the exit code."""
     failed: dict[mcg.Status, list[str]] = {}
@@ -293,8 +289,7 @@ def _verdict(results: dict[str, mcg.RegistrationResult]) -> int:
         if not result.converged:
             failed.setdefault(result.status, []).append(name)
     for status, names in failed.items():
-        words = _words(results[names[0]])
-        print(f"mcgicp: {', '.join(names)}: {words}: {with_flags(status.advice)}", file=sys.stderr)
+        print(f"mcgicp: {', '.join(names)}: {status.name}: {with_flags(status.advice)}", file=sys.stderr)
     return 1 if failed else 0
 
 

@@ -362,6 +362,9 @@ class PointCloud(eqx.Module):
         return int(np.count_nonzero(self.valid))
 
     def __repr__(self) -> str:
+        # Leaves may be no arrays, as after `jax.eval_shape` or `jax.tree.map`.
+        if not isinstance(self.points, np.ndarray | jax.Array):
+            return f"PointCloud(points={self.points!r}, channels={self.channels!r})"
         if not is_concrete(self) or self.points.ndim != 2:
             size = f"shape {tuple(self.points.shape[:-1])}"
         elif len(self) == self.points.shape[0]:

@@ -262,7 +262,7 @@ class _Sensor(Iterator[OdometryStep]):
                 if not is_usable(result):
                     warn(
                         f"{name}: {result.status.name}; the motion of the previous frame is used instead. "
-                        "mcgicp_jax.odometry(..., recover=True) finds lost frames again"
+                        "recover=True finds lost frames again"
                     )
                 elif doubt := doubt_of(result):
                     warn(f"{name}: {doubt}")
