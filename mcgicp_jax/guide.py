@@ -80,13 +80,12 @@ The covariance of a prior is that of ξ = (v, ω) in T = pose · exp(ξ), in the
 `RegistrationResult.covariance`: ξ is expressed at the origin and in the axes of the source. So a GNSS covariance Σ in
 the target's axes becomes Rᵀ Σ R, and at UTM coordinates, the covariance of a pose measured at the cloud must be
 transported to their origin. Give directions that are not measured a large, finite variance. Standard deviations other
-than 0 count as at least 1.1e-5 radians (in float64 4.7e-10), or 1.1e-5 of the largest centred coordinate of the source.
-Inside `jit`, and where the covariance is differentiated, they do not, and the covariance is not checked.
+than 0 count as at least 7e-6 radians (in float64 3e-10), or 7e-6 of the largest centred coordinate of the source.
 
 A variance of 0, or any singular covariance, fixes directions, whatever the clouds say: the initial pose is moved onto
 them, ξ along them stays 0, the covariance is 0 up to rounding, `directions.ties` are infinite, `information` has
 nothing of the prior along them, and the clouds need not constrain them. Inside `jit`, give such a covariance as a NumPy
-array: one of `jnp`, which is traced there, must be positive definite and not too uneven, or the status is NON_FINITE.
+array: one of `jnp` is traced there, so that it is not checked, and its variances of 0 are the least ones.
 
 The pose is differentiable by the points of the tie points, the pose of the prior, and covariances other than 0. The
 weights of the matches are constants to autodiff. Where some directions are fixed, the derivative by the pose of the

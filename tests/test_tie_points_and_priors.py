@@ -113,6 +113,46 @@ def test_a_precise_prior_has_the_same_effect_and_checks_where_points_are_differe
     refused(lambda: jax.vjp(lambda points: pose(points, skewed), points), "prior: covariance", "not symmetric")
 
 
+# Standard deviations (v, ω), from far below the least ones to those of directions that are not measured.
+UNEVEN = {
+    "tight": 3 * [1e-7] + 3 * [1e-9],
+    "mixed": [1e-4, 1e-3, 1e-7, 1e-9, 1e3, 1e-8],
+    "position": 3 * [1e-6] + 3 * [1e6],
+    "rotation": 3 * [1e6] + 3 * [1e-7],
+}
+
+
+@pytest.mark.parametrize("deviations", UNEVEN.values(), ids=UNEVEN.keys())
+def test_the_information_of_an_uneven_prior_is_the_same_where_its_covariance_is_traced(corner, deviations):
+    source, target, truth = corner
+    given = (0.9 * np.eye(6) + 0.1) * np.outer(deviations, deviations)
+
+    def information(given):
+        return checked_measurements(None, (truth, given), source, target)[1].information
+
+    expected, traced = information(given), jax.jit(information)(given.astype(np.float32))
+    scale = np.sqrt(np.diagonal(expected))
+    np.testing.assert_allclose(traced / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-3)
+
+
+@pytest.mark.slow
+def test_an_uneven_prior_has_the_same_effect_where_its_covariance_is_traced(corner):
+    source, target, truth = corner
+
+    def pose(given):
+        prior = (truth @ motion((0.01, 0, 0, 0, 0, 0.003))).astype(np.float32), given
+        result = mcg.register(source, target, mcg.GICP(), prior=prior, **OPTIONS)
+        return result.matrix, result.status_code
+
+    inside = jax.jit(pose)
+    for deviations in UNEVEN.values():
+        given = np.diag(np.square(deviations)).astype(np.float32)
+        expected, code = pose(given)
+        matrix, traced_code = inside(given)
+        np.testing.assert_allclose(matrix, expected, atol=2e-6)
+        assert code == traced_code
+
+
 @pytest.mark.parametrize(
     "method", [mcg.GICP(), mcg.PointToPlane(), mcg.D2DNDT()], ids=["gicp", "point-to-plane", "d2d-ndt"]
 )
@@ -180,7 +220,8 @@ def test_the_information_of_a_prior_belongs_to_the_origin_of_the_cloud(corner, a
     rng, far = np.random.default_rng(0), np.array([300.0, -400.0, 100.0])
     source, target = (mcg.preprocess(np.asarray(cloud.points, np.float64) + far) for cloud in corner[:2])
     assert np.any(source.origin)
-    given = covariance(rng, 6, 0.01)
+    # At the cloud, a deviation is 4e-5: 4 times the least one.
+    given = covariance(rng, 6, 0.03)
     if at_cloud:
         there = np.eye(6)
         there[:3, 3:] = np.cross(far, np.eye(3)).T

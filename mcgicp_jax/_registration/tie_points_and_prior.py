@@ -35,8 +35,9 @@ from mcgicp_jax._registration.loop import Problem, State
 # Largest asymmetry of a correlation matrix, as rounding to float32 causes; and smallest eigenvalue with which the
 # inverse of a correlation matrix keeps four digits in float64. Below it, a direction of a prior counts as fixed.
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
-# Largest rounding of the information of a prior, with lengths in units of the cloud: a standard deviation of 3 %.
-_LARGEST_ERROR = 1e3
+# Rounding of the information of a prior at the least standard deviation σ₀, with lengths in units of the cloud: a
+# standard deviation of 3 %. A variance v becomes v + σ₀² (1 + v/σ₀²)⁻⁸: nearly the larger of the two, at least 0.42 σ₀².
+_LARGEST_ERROR, _SHARPNESS = 1e3, 8
 # Standard deviations of a prior, of the motion of a point, within which the right pose is expected.
 _DEVIATIONS = 3.0
 # Source points (n, 3), target points (n, 3) and covariances (n, 3, 3); pose and covariance (6, 6).
@@ -80,19 +81,45 @@ def _centred_prior(prior: GivenPrior, source: PointCloud, target: PointCloud) ->
     if is_concrete(value):
         values, rows = _principal_rows(np.asarray(value, np.float64))
         fixed = _orthonormal(rows[values <= _LEAST_EIGENVALUE])
-    return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin))
+    variances = (_lengths(cloud) * _least_deviation(cloud)) ** 2
+    return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin, variances))
+
+
+def _lengths(source: PointCloud) -> Float[AnyArray, "6"]:
+    """Units of ξ in which its components move the points of the cloud by similar distances."""
+    xp = numpy_for(source.points)
+    radius = xp.maximum(xp.max(xp.abs(source.points), initial=0), 1e-30)
+    return xp.repeat(xp.stack([radius, xp.ones_like(radius)]), 3)
+
+
+def _least_deviation(source: PointCloud) -> float:
+    """σ₀ of `_LARGEST_ERROR`, in units of `_lengths`; the rounding of more precise directions would spoil the others."""
+    return float(np.sqrt(np.finfo(source.points.dtype).eps / _LARGEST_ERROR))
 
 
 @jax.jit
 def _information_traced(
-    covariance: Float[AnyArray, "6 6"], fixed: Float[AnyArray, "6 6"] | None, origin: Float[AnyArray, "3"]
+    covariance: Float[AnyArray, "6 6"],
+    fixed: Float[AnyArray, "6 6"] | None,
+    origin: Float[AnyArray, "3"],
+    least_variances: Float[AnyArray, "6"],
 ) -> tuple[Float[AnyArray, "6 6"], Float[AnyArray, "6 6"] | None]:
-    change = translation_adjoint(-origin)
+    """See `_information`."""
+
+    def inverse(covariance: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
+        deviations = jnp.sqrt(jnp.diagonal(covariance))
+        scale = deviations[:, None] * deviations
+        return inverse_6(covariance / scale) / scale
+
+    def information(covariance: Float[AnyArray, "6 6"], least: Float[AnyArray, "6 6"]) -> Float[AnyArray, "6 6"]:
+        return inverse(covariance + jnp.linalg.matrix_power(least @ inverse(covariance + least), _SHARPNESS) @ least)
+
     if fixed is None:
-        return inverse_6(change @ covariance @ change.T), None
+        change = translation_adjoint(-origin)
+        return information(change @ covariance @ change.T, jnp.diag(least_variances)), None
     back, across = translation_adjoint(origin), fixed.T @ fixed
     within = (jnp.eye(6) - across) @ back
-    return within.T @ inverse_6(covariance + across) @ within, fixed @ back
+    return within.T @ information(covariance + across, (back * least_variances) @ back.T) @ within, fixed @ back
 
 
 def _principal_rows(covariance: Float[np.ndarray, "6 6"]) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"]]:
@@ -131,11 +158,10 @@ def _information(
     fixed = values <= _LEAST_EIGENVALUE
     rows = rows @ translation_adjoint(source.origin - offset)
     root = np.where(fixed, 0, 1 / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)))[:, None] * rows
-    points = np.asarray(source.points)
-    lengths = np.repeat([max(float(np.abs(points).max(initial=0)), 1e-30), 1.0], 3)
+    lengths = np.asarray(_lengths(source), np.float64)
     _, values, vectors = np.linalg.svd(root * lengths)
-    # The rounding of more precise directions would spoil the others.
-    root = np.minimum(values, np.sqrt(_LARGEST_ERROR / np.finfo(points.dtype).eps))[:, None] * vectors / lengths
+    ratios = (values * _least_deviation(source)) ** 2
+    root = (values / np.sqrt(1 + ratios * (ratios / (1 + ratios)) ** _SHARPNESS))[:, None] * vectors / lengths
     return root.T @ root, _orthonormal(rows[fixed], lengths)
 
 
