@@ -106,7 +106,26 @@ class Edge(AbstractFactor):
             raise ValueError("information: expected either an information or a covariance matrix, got both or neither")
         self.i, self.j = _rows("i", i), _rows("j", j)
         self.T_i_j = _as_float("T_i_j", matrix_of(T_i_j))
-        self.information = _inverse(covariance) if information is None else _as_float("information", information)
+        if information is not None:
+            self.information = _as_float("information", information)
+        elif not is_concrete(covariance):
+            self.information = jnp.linalg.inv(covariance)
+        else:
+            matrix = np.asarray(_as_float("covariance", covariance))
+            if matrix.shape[-2:] != (6, 6):
+                raise ValueError(f"covariance: expected shape (6, 6), got {matrix.shape}")
+            if not np.isfinite(matrix).all():
+                raise ValueError("covariance: expected finite numbers, got NaN or infinity")
+            sigma = np.sqrt(np.abs(np.diagonal(matrix, 0, -2, -1)))
+            limit = _ROUNDING * sigma[..., :, None] * sigma[..., None, :]
+            if np.any(np.abs(matrix - matrix.swapaxes(-1, -2)) > limit):
+                raise ValueError(f"covariance: expected a symmetric matrix, got {matrix}")
+            try:
+                np.linalg.cholesky(matrix)
+            except np.linalg.LinAlgError as error:
+                raise ValueError("covariance: expected a positive definite matrix") from error
+            inverted = np.linalg.inv(matrix)
+            self.information = 0.5 * (inverted + inverted.swapaxes(-1, -2))
         shape = np.shape(self.i)
         traced = isinstance(uncertain, jax.Array)
         self.uncertain = jnp.asarray(uncertain) if traced else np.broadcast_to(np.asarray(uncertain, bool), shape)
@@ -179,22 +198,3 @@ def _as_float(name: str, values: Any) -> Any:
         return np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name}: expected an array of numbers, got {values!r}") from error
-
-
-def _inverse(covariance: Any) -> Any:
-    if not is_concrete(covariance):
-        return jnp.linalg.inv(covariance)
-    covariance = np.asarray(_as_float("covariance", covariance))
-    if covariance.shape[-2:] != (6, 6):
-        raise ValueError(f"covariance: expected shape (6, 6), got {covariance.shape}")
-    if not np.isfinite(covariance).all():
-        raise ValueError("covariance: expected finite numbers, got NaN or infinity")
-    scale = np.sqrt(np.abs(np.diagonal(covariance, 0, -2, -1)))
-    if np.any(np.abs(covariance - covariance.swapaxes(-1, -2)) > _ROUNDING * scale[..., :, None] * scale[..., None, :]):
-        raise ValueError(f"covariance: expected a symmetric matrix, got {covariance}")
-    try:
-        np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError as error:
-        raise ValueError("covariance: expected a positive definite matrix") from error
-    information = np.linalg.inv(covariance)
-    return 0.5 * (information + information.swapaxes(-1, -2))

@@ -21,7 +21,7 @@ from mcgicp_jax._compute.concrete import AnyArray, is_concrete
 from mcgicp_jax._compute.messages import calling_line, shown_at, warn
 from mcgicp_jax._compute.programs import call_host
 from mcgicp_jax._math.poses import logarithm_derivative, skew
-from mcgicp_jax._pose_graph.edge import WORLD, Edge, Factors, check_rows, motion_jacobians
+from mcgicp_jax._pose_graph.edge import WORLD, Factors, check_rows, motion_jacobians
 from mcgicp_jax._pose_graph.levenberg_marquardt import GraphState, factored, typical_information
 from mcgicp_jax._pose_graph.robust_solver import GraphPoses, covariances_at, solve
 from mcgicp_jax._registration.result import Status
@@ -43,7 +43,7 @@ class _Sensitivity(NamedTuple):
 
 @partial(jax.custom_jvp, nondiff_argnums=(2, 3))
 def solve_traced(poses: Float[AnyArray, "n 4 4"], factors: Factors, robust: bool, max_iterations: int) -> GraphPoses:
-    """`solver.solve`, differentiable with respect to the edges, not to the initial poses."""
+    """`robust_solver.solve`, differentiable with respect to the edges, not to the initial poses."""
     return _solved(poses, factors, robust, max_iterations, False)[0]
 
 
@@ -139,35 +139,29 @@ def _sensitivity(state: GraphState, result: GraphPoses, dtype: DTypeLike) -> _Se
     inverse = np.zeros((len(poses), 6, len(poses), 6))
     by_edge = [np.zeros((len(equations.rows), *shape)) for shape in ((2, 6, 6), (2, 6, 6), (6,))]
     if result.status == Status.CONVERGED:
-        blocks, *derivatives = _derivatives(equations.factors[0], poses[equations.rows])
-        for values, derivative in zip(by_edge, derivatives, strict=True):
+        # J = BD, with the inverse B of the right Jacobian of SE(3) at r and the derivative D of T_i⁻¹ T_j by both.
+        edges, pairs = equations.factors[0], poses[equations.rows]
+        residuals, jacobians = edges.linearize(pairs)
+        motion, information = motion_jacobians(pairs), np.asarray(edges.information)
+        forces = information @ residuals[..., None]
+        steps = _STEP * np.eye(6)[:, None]
+        slopes = (logarithm_derivative(residuals + steps) - logarithm_derivative(residuals - steps)) / (2 * _STEP)
+        # ∂(BᵀΛr)/∂r, and the derivatives of JᵀΛr by the twists of both poses, (m, 2, 2, 6, 6).
+        by_residual = jacobians[:, 1].swapaxes(1, 2) @ information + np.einsum("bmia,mi->mab", slopes, forces[..., 0])
+        outer = motion.swapaxes(2, 3) @ by_residual[:, None]
+        blocks = outer[:, :, None] @ jacobians[:, None]
+        # D depends on the poses, too: dD_i = D_i ad(ξ_i) − ad(ξ_j) D_i.
+        first, second = np.moveaxis((jacobians.swapaxes(2, 3) @ forces[:, None])[..., 0], 1, 0)
+        blocks[:, 0, 0] += _coadjoint(first)
+        blocks[:, 0, 1] -= motion[:, 0].swapaxes(1, 2) @ _coadjoint(second)
+        by_motion = outer @ -logarithm_derivative(-residuals)[:, None]
+        for values, derivative in zip(by_edge, (by_motion, jacobians, residuals), strict=True):
             values[state.weights > 0] = derivative[state.weights > 0]
         if equations.size:
             # From unknowns to poses: first the rows, then the columns of the inverse.
             columns = equations.spread(factored(equations.matrix(blocks, state.weights)).solve(np.eye(equations.size)))
             inverse = equations.spread(np.moveaxis(columns, 2, 0))
     return _Sensitivity(*(values.astype(dtype) for values in (inverse[:n, :, :n], *by_edge)))
-
-
-def _derivatives(edges: Edge, poses: Float[np.ndarray, "m 2 4 4"]) -> tuple[np.ndarray, ...]:
-    """Derivatives of JᵀΛr by the twists of both poses, (m, 2, 2, 6, 6), and by that of the motion; J, and r.
-
-    J = BD, with the inverse B of the right Jacobian of SE(3) at r and the derivative D of T_i⁻¹ T_j by both poses.
-    """
-    residuals, jacobians = edges.linearize(poses)
-    motion, information = motion_jacobians(poses), np.asarray(edges.information)
-    forces = information @ residuals[..., None]
-    steps = _STEP * np.eye(6)[:, None]
-    slopes = (logarithm_derivative(residuals + steps) - logarithm_derivative(residuals - steps)) / (2 * _STEP)
-    # ∂(BᵀΛr)/∂r.
-    by_residual = jacobians[:, 1].swapaxes(1, 2) @ information + np.einsum("bmia,mi->mab", slopes, forces[..., 0])
-    outer = motion.swapaxes(2, 3) @ by_residual[:, None]
-    blocks = outer[:, :, None] @ jacobians[:, None]
-    # D depends on the poses, too: dD_i = D_i ad(ξ_i) − ad(ξ_j) D_i.
-    first, second = np.moveaxis((jacobians.swapaxes(2, 3) @ forces[:, None])[..., 0], 1, 0)
-    blocks[:, 0, 0] += _coadjoint(first)
-    blocks[:, 0, 1] -= motion[:, 0].swapaxes(1, 2) @ _coadjoint(second)
-    return blocks, outer @ -logarithm_derivative(-residuals)[:, None], jacobians, residuals
 
 
 def _coadjoint(forces: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m 6 6"]:

@@ -31,12 +31,6 @@ _START_DAMPING, _DAMPING_FACTOR, _MOST_DAMPING = 1e-4, 10.0, 1e12
 _TOLERANCE = 1e-6
 # The same in σ², for graphs without contradiction: a step of a millionth of a standard deviation.
 _LEAST_DECREASE = 1e-12
-# Largest number of steps of `refine`, each of which reduces the error by a factor of 10 or more, and the relative size
-# of the last one.
-_REFINEMENTS, _ROUNDING = 10, 1e-13
-# Weight of the anchors in `settle`. Poses in corridors slide by 0.49 m without, and by 0.12, 0.03 and
-# 0.01 m with 1, 2 and 3; errors of a sphere that loops correct are 8.8 m without, and 7.8, 10.5 and 12.7 m.
-_ANCHOR_WEIGHT = 2.0
 
 
 class Terms(NamedTuple):
@@ -241,35 +235,3 @@ def minimize(state: GraphState, max_iterations: int) -> GraphState:
         else:
             damping *= _DAMPING_FACTOR
     return state._replace(num_iterations=state.num_iterations + count, damping=damping)
-
-
-def refine(state: GraphState) -> GraphState:
-    """The minimum to rounding, by more Gauss-Newton steps: derivatives are only as exact as the poses."""
-    for _ in range(_REFINEMENTS):
-        before = state.poses
-        refined = minimize(state._replace(damping=LEAST_DAMPING), 1)
-        state = refined._replace(num_iterations=state.num_iterations, converged=True)
-        if np.abs(state.poses - before).max() <= _ROUNDING * np.abs(state.poses).max():
-            break
-    return state
-
-
-def settle(state: GraphState, is_anchor: Mask) -> Poses:
-    """Undo drift, due to noise, along directions that only the anchors (see `solver._anchors`) constrain.
-
-    Anchors have information ε there, and the measurements leak information μ, so they would weigh μ/ε against anchors.
-    If ε is imaginary, the real part of the step is −(μg + ε²b)/(μ² + ε²), for gradients g of the measurements and εb of
-    the anchors: at its root, measurements weigh (μ/ε)². Along measured directions, anchors weigh at most (ε/μ)².
-    """
-    equations, last = state.equations, np.inf
-    measured, anchored = state.weights * ~is_anchor, _ANCHOR_WEIGHT * is_anchor
-    for _ in range(_REFINEMENTS):
-        system = equations.matrix(state.terms.blocks, measured + 1j * anchored)
-        gradient = equations.gradient(state.terms, measured) + 1j * equations.gradient(state.terms, anchored)
-        step = -factored(equations.damped(system)).solve(gradient).real
-        largest = np.abs(step).max()
-        # The steps have reached rounding, or do not contract.
-        if not largest < last:
-            break
-        state, last = state.moved(step), largest
-    return state.poses

@@ -74,7 +74,11 @@ def _inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
     columns.sort_indices()
     entries = np.split(columns.indices, columns.indptr[1:-1])
     blocks = np.split(columns.data.swapaxes(1, 2), columns.indptr[1:-1])
-    below = _rows_below(entries)
+    # N of every block: rows with entries in L, and those of its children, which Z[N, N] of the children needs.
+    below = [rows[rows > k] for k, rows in enumerate(entries)]
+    for rows in below:
+        if len(rows) > 1:
+            below[rows[0]] = np.union1d(below[rows[0]], rows[1:])
     diagonal = np.empty((number, _SIZE, _SIZE))
     children = np.bincount([rows[0] for rows in below if len(rows)], minlength=number)
     # For each block k with children still to be visited: the rows k and N, and Z between these rows.
@@ -104,13 +108,3 @@ def _inverse_blocks(factor: Any) -> Float[np.ndarray, "n 6 6"]:
         if children[k]:
             fronts[k] = members, front
     return diagonal[place]
-
-
-def _rows_below(entries: list[Int[np.ndarray, "_"]]) -> list[Int[np.ndarray, "_"]]:
-    """N of every block: rows with entries in L, and those of its children, which Z[N, N] of the children needs."""
-    below = [rows[rows > k] for k, rows in enumerate(entries)]
-    for rows in below:
-        if len(rows) > 1:
-            parent = rows[0]
-            below[parent] = np.union1d(below[parent], rows[1:])
-    return below

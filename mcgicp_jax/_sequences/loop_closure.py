@@ -177,22 +177,18 @@ class Trajectory:
             num_tries += 1
             if edge is not None:
                 self._connect(edge)
-                self._correct(edge, covariance)
+                # Correct all poses, or the last one alone. `covariance` is that of the motion without the loop.
+                self._stale, pose = True, self._poses[last]
+                residual = logarithm(inverse(self._poses[i] @ np.asarray(edge.T_i_j)) @ pose)
+                total = covariance + self._covariances[-1]
+                contradicts = residual @ np.linalg.solve(total, residual) > _CONTRADICTION
+                if contradicts or len(self._poses) >= _GROWTH * self._num_optimized:
+                    self._optimize()
+                else:
+                    gain = np.linalg.solve(total, covariance).T
+                    self._poses[last] = pose @ exponential(-gain @ residual)
             if edge is not None or num_tries == _TRIES:
                 return
-
-    def _correct(self, loop: Edge, covariance: Float[np.ndarray, "6 6"]) -> None:
-        """Correct the poses by the loop added last. `covariance`: of the motion between its frames without the loop."""
-        self._stale = True
-        pose = self._poses[-1]
-        residual = logarithm(inverse(self._poses[int(loop.i)] @ np.asarray(loop.T_i_j)) @ pose)
-        total = covariance + self._covariances[-1]
-        contradicts = residual @ np.linalg.solve(total, residual) > _CONTRADICTION
-        if contradicts or len(self._poses) >= _GROWTH * self._num_optimized:
-            self._optimize()
-        else:
-            gain = np.linalg.solve(total, covariance).T
-            self._poses[-1] = pose @ exponential(-gain @ residual)
 
     def _optimize(self) -> None:
         result = optimize_poses(PoseGraph(self._poses, self._edges))

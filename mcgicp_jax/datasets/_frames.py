@@ -95,17 +95,14 @@ class _Slice(AbstractFrames):
         return self._whole.name(self._rows[index])
 
 
-class _Cropped(AbstractFrames):
+class _Cropped(_Slice):
     def __init__(self, whole: AbstractFrames, min_range: float, max_range: float):
-        super().__init__(len(whole))
-        self._whole, self._range, self.to_camera = whole, (min_range, max_range), whole.to_camera
+        super().__init__(whole, range(len(whole)))
+        self._range = min_range, max_range
 
     def _frame(self, index: int) -> Frame:
-        frame = self._whole[index]
+        frame = super()._frame(index)
         return Frame(frame.cloud.crop(*self._range), frame.pose, frame.time)
-
-    def name(self, index: int) -> str:
-        return self._whole.name(index)
 
 
 class SyntheticFrames(AbstractFrames):

@@ -48,6 +48,7 @@ _PALETTE = np.array(
         [0.55, 0.38, 0.25],
     ]
 )
+_DESIGNS = ("gradient", "stripes", "text", "discs", "diamonds")
 
 # Metres to the right and downwards along the wall.
 Offset: TypeAlias = Float[np.ndarray, "2"]
@@ -133,56 +134,46 @@ def _paint_wall(rng: np.random.Generator) -> Image:
     cell = np.array([round(_CELL_WIDTH / _TEXEL), round(_CELL_HEIGHT / _TEXEL)])
     wall = np.empty((_ROWS * cell[1], _COLUMNS * cell[0], 3), np.float32)
     wall[:] = _WALL_COLOR
-    designs = [_gradient, _stripes, _text, _discs, _diamonds]
-    for i, design in enumerate(rng.permutation(_ROWS * _COLUMNS)):
+    for i, number in enumerate(rng.permutation(_ROWS * _COLUMNS)):
         size = (cell * rng.uniform(0.62, 0.92, 2)).astype(int)
         left, top = cell * (i % _COLUMNS, i // _COLUMNS) + rng.integers(0, cell - size)
         width, height = size * _TEXEL
         x, y = np.meshgrid((np.arange(size[0]) + 0.5) * _TEXEL, (np.arange(size[1]) + 0.5) * _TEXEL)
         frame, *colors = rng.permutation(_PALETTE)
-        poster = designs[design % len(designs)](rng, x, y, np.array(colors))
+        poster = _poster(_DESIGNS[number % len(_DESIGNS)], rng, x, y, np.array(colors))
         poster[np.minimum(np.minimum(x, width - x), np.minimum(y, height - y)) < _BORDER] = frame
         wall[top : top + size[1], left : left + size[0]] = poster
     return wall
 
 
-def _gradient(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
+def _poster(design: str, rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
+    if design == "text":
+        # Words are solid blocks; the first line is a larger headline.
+        ink, paper = sorted(colors[:4], key=np.sum)[::3]
+        letters = np.zeros(x.shape, bool)
+        top, height = 0.04, 0.07
+        while top < y.max():
+            line = (y >= top) & (y < top + height) & (x > 0.04) & (x < x.max() - 0.04)
+            letters |= line & (_bands(rng, x, 0.4 * height, 3 * height) % 2 == 0)
+            top += 1.6 * height
+            height = rng.uniform(0.018, 0.032)
+        return np.where(letters[..., None], ink, paper)
+    if design == "discs":
+        label = np.zeros(x.shape, int)
+        for i in range(14):
+            radius = rng.uniform(0.03, 0.12)
+            center_x, center_y = rng.uniform(0, x.max()), rng.uniform(0, y.max())
+            label[np.hypot(x - center_x, y - center_y) < radius] = 1 + i % (len(colors) - 1)
+        return colors[label]
+    if design == "diamonds":
+        # Bands at 45° across bands at −45°.
+        return colors[(_bands(rng, x + y, 0.08, 0.25) + 2 * _bands(rng, x - y, 0.08, 0.25)) % 5]
     angle = rng.uniform(0, 2 * np.pi)
     along = np.cos(angle) * x + np.sin(angle) * y
+    if design == "stripes":
+        return colors[_bands(rng, along, 0.02, 0.10) % 4]
     fraction = (along - along.min()) / np.ptp(along)
     return np.stack([np.interp(fraction, [0, 0.5, 1], channel) for channel in colors[:3].T], axis=-1)
-
-
-def _stripes(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    angle = rng.uniform(0, 2 * np.pi)
-    return colors[_bands(rng, np.cos(angle) * x + np.sin(angle) * y, 0.02, 0.10) % 4]
-
-
-def _diamonds(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    # Bands at 45° across bands at −45°.
-    return colors[(_bands(rng, x + y, 0.08, 0.25) + 2 * _bands(rng, x - y, 0.08, 0.25)) % 5]
-
-
-def _discs(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    label = np.zeros(x.shape, int)
-    for i in range(14):
-        radius = rng.uniform(0.03, 0.12)
-        center_x, center_y = rng.uniform(0, x.max()), rng.uniform(0, y.max())
-        label[np.hypot(x - center_x, y - center_y) < radius] = 1 + i % (len(colors) - 1)
-    return colors[label]
-
-
-def _text(rng: np.random.Generator, x: Grid, y: Grid, colors: Colors) -> Image:
-    # Words are solid blocks; the first line is a larger headline.
-    ink, paper = sorted(colors[:4], key=np.sum)[::3]
-    letters = np.zeros(x.shape, bool)
-    top, height = 0.04, 0.07
-    while top < y.max():
-        line = (y >= top) & (y < top + height) & (x > 0.04) & (x < x.max() - 0.04)
-        letters |= line & (_bands(rng, x, 0.4 * height, 3 * height) % 2 == 0)
-        top += 1.6 * height
-        height = rng.uniform(0.018, 0.032)
-    return np.where(letters[..., None], ink, paper)
 
 
 def _bands(rng: np.random.Generator, along: Grid, narrowest: float, widest: float) -> Int[np.ndarray, "h w"]:

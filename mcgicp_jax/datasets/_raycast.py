@@ -1,4 +1,4 @@
-"""Ray casting into scenes of boxes and upright cylinders, rays of sensors, and random surface patterns; in metres."""
+"""Ray casting into scenes of boxes and upright cylinders, random rays, and random surface patterns; in metres."""
 
 from __future__ import annotations
 
@@ -106,17 +106,6 @@ def random_rays(rng: np.random.Generator, size: int) -> Rays:
     """Random unit rays, uniform over the sphere."""
     rays = rng.normal(size=(size, 3))
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
-
-
-def spinning_rays(rng: np.random.Generator, size: int, beams: int, lowest: float, highest: float) -> Rays:
-    """About `size` unit rays of one turn of a LiDAR: x ahead, z up, beams between two elevations in radians."""
-    columns = max(round(size / beams), 1)
-    beam = np.arange(beams)
-    # As in a real LiDAR, each beam has its own offset. Multiples of the golden ratio spread them evenly over a column.
-    azimuth = 2 * np.pi / columns * (np.arange(columns)[:, None] + rng.uniform() + 0.618034 * beam % 1)
-    elevation = np.broadcast_to(np.linspace(lowest, highest, beams), azimuth.shape)
-    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
-    return np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
 
 
 def sensor_rotation(heading: float, tilt: float, direction: float) -> Rotation:

@@ -88,19 +88,16 @@ class TUMFrames(AbstractFrames):
         image = read_image(self.folder / self._colors[index])
         cloud = PointCloud.from_depth(depth, self._camera, image, scale=_DEPTH_SCALE)
         _, pixels = back_project(depth, self._camera)
-        return Frame(cloud, self._pose(self._times[index]), float(self._times[index]), image, pixels)
-
-    def _pose(self, time: float) -> Float[np.ndarray, "4 4"] | None:
-        """The measured pose interpolated to a time in seconds; None if it is unknown."""
-        times, poses = self._pose_times, self._poses
+        # The measured pose, or one interpolated between the two around the time if there is no gap.
+        time, times, poses, pose = float(self._times[index]), self._pose_times, self._poses, None
         after = int(np.searchsorted(times, time))
         if after < len(times) and times[after] == time:
-            return poses[after]
-        if not 0 < after < len(times) or times[after] - times[after - 1] > _MAX_GAP:
-            return None
-        around = slice(after - 1, after + 1)
-        rotation = Slerp(times[around], Rotation.from_matrix(poses[around, :3, :3]))(time)
-        return pose_of(rotation, [np.interp(time, times[around], values) for values in poses[around, :3, 3].T])
+            pose = poses[after]
+        elif 0 < after < len(times) and times[after] - times[after - 1] <= _MAX_GAP:
+            around = slice(after - 1, after + 1)
+            rotation = Slerp(times[around], Rotation.from_matrix(poses[around, :3, :3]))(time)
+            pose = pose_of(rotation, [np.interp(time, times[around], values) for values in poses[around, :3, 3].T])
+        return Frame(cloud, pose, time, image, pixels)
 
 
 def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], Shaped[np.ndarray, "N"]]:

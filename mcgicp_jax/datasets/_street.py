@@ -94,15 +94,7 @@ def street(
     road = raycast.Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
     things = [_Thing("ground", road, np.full(3, 0.33), 0.2)]
     for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
-        low, high = np.array([start, _KERB, -1.0]), np.array([end, 30.0, _KERB_HEIGHT])
-        things.append(_Thing("pavement", _box(low, high, side), np.full(3, 0.52), 0.3))
-        # Each kind in order of x, so that a longer street begins like a shorter one.
-        for make, kind_rng in zip((_building, _car, _pole, _bin), side_rng.spawn(4), strict=True):
-            x = start
-            while x < end:
-                new_things, advance = make(kind_rng, side, x)
-                things += new_things
-                x += advance
+        things += _side_of_street(side_rng, side, start, end)
     observer = partial(_observe, things, int(rng.integers(2**31)), points_per_frame, noise)
     path = partial(_pose, spin, step, *path_rng.uniform(0, 2 * np.pi, 3))
     return SyntheticFrames(num_frames, path, observer, _PERIOD, seed, _POSES_OF_A_TURN if spin else 1)
@@ -121,10 +113,17 @@ def _pose(smooth: bool, step: float, sway: float, yaw: float, tilt: float, time:
 def _observe(
     things: list[_Thing], pattern: int, size: int, noise: float, rng: Generator, poses: Float[np.ndarray, "*poses 4 4"]
 ) -> PointCloud:
+    # One turn of the LiDAR. As in a real one, each beam has its own offset. Multiples of the golden ratio spread them
+    # evenly over a column.
+    columns, beam = max(round(size / _BEAMS), 1), np.arange(_BEAMS)
+    azimuth = 2 * np.pi / columns * (np.arange(columns)[:, None] + rng.uniform() + 0.618034 * beam % 1)
+    elevation = np.broadcast_to(np.linspace(_LOWEST, _HIGHEST, _BEAMS), azimuth.shape)
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    rays = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
     # Each pose of the turn measures one sector of the rays.
     poses, solids = poses.reshape(-1, 4, 4), [thing.solid for thing in things]
-    rays = np.array_split(raycast.spinning_rays(rng, size, _BEAMS, _LOWEST, _HIGHEST), len(poses))
-    sectors = [raycast.cast(pose, sector, solids, _MAX_RANGE) for pose, sector in zip(poses, rays, strict=True)]
+    shares = zip(poses, np.array_split(rays, len(poses)), strict=True)
+    sectors = [raycast.cast(pose, share, solids, _MAX_RANGE) for pose, share in shares]
     hits = raycast.Hits(*map(np.concatenate, zip(*sectors, strict=True)))
     times = None if len(poses) == 1 else np.repeat(np.arange(len(poses)), [len(sector.rays) for sector in sectors])
 
@@ -148,45 +147,55 @@ def _box(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], side: int) -
     return raycast.Box(np.minimum(mirror * low, mirror * high), np.maximum(mirror * low, mirror * high))
 
 
-# Each of these makes the things of one kind that begin at `x`, and returns the distance to the start of the next.
+def _side_of_street(rng: Generator, side: int, start: float, end: float) -> list[_Thing]:
+    """Pavement, buildings, cars, poles and bins of one side (see `_box`), from one x to another.
 
+    Each kind has a generator of its own and is made in order of x, so that a longer street begins like a shorter one.
+    """
+    buildings, cars, poles, bins = rng.spawn(4)
+    low, high = np.array([start, _KERB, -1.0]), np.array([end, 30.0, _KERB_HEIGHT])
+    things = [_Thing("pavement", _box(low, high, side), np.full(3, 0.52), 0.3)]
 
-def _building(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
-    width, height, setback = rng.uniform((7, 6, 0), (16, 15, 0.8))
-    pitch, opening = rng.uniform((1.8, 2.9), (3.2, 3.5)), rng.uniform((0.8, 1.3), (1.4, 1.9))
-    # Fit a whole number of windows and storeys, so that no window is cut off.
-    pitch = np.array([width, height]) / np.round((width, height) / pitch)
-    low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
-    color, reflectance = rng.choice(_WALLS) * rng.uniform(0.85, 1.1), rng.uniform(0.25, 0.55)
-    windows = np.array([*pitch, *opening, rng.uniform(0.08, 0.25)])
-    building = _Thing("building", _box(low, high, side), color, reflectance, windows)
-    # The next building is adjacent, behind a passage, or across a side street.
-    return [building], width + rng.choice([0, rng.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
+    x = start
+    while x < end:
+        width, height, setback = buildings.uniform((7, 6, 0), (16, 15, 0.8))
+        pitch, opening = buildings.uniform((1.8, 2.9), (3.2, 3.5)), buildings.uniform((0.8, 1.3), (1.4, 1.9))
+        # Fit a whole number of windows and storeys, so that no window is cut off.
+        pitch = np.array([width, height]) / np.round((width, height) / pitch)
+        low, high = np.array([x, _FACADE + setback, 0.0]), np.array([x + width, _FACADE + setback + _DEPTH, height])
+        color, reflectance = buildings.choice(_WALLS) * buildings.uniform(0.85, 1.1), buildings.uniform(0.25, 0.55)
+        windows = np.array([*pitch, *opening, buildings.uniform(0.08, 0.25)])
+        things.append(_Thing("building", _box(low, high, side), color, reflectance, windows))
+        # The next building is adjacent, behind a passage, or across a side street.
+        x += width + buildings.choice([0, buildings.uniform(1.5, 4), 9], p=[0.7, 0.2, 0.1])
 
+    x = start
+    while x < end:
+        length, width, sill, roof = cars.uniform((3.6, 1.65, 0.85, 1.40), (4.9, 1.85, 1.05, 1.60))
+        y = cars.uniform(_PARKING + 0.1, _KERB - width - 0.05)
+        color, reflectance = cars.choice(_CARS), cars.uniform(0.15, 0.6)
+        body = _box(np.array([x, y, 0.2]), np.array([x + length, y + width, sill]), side)
+        bonnet, boot = cars.uniform((0.8, 0.2), (1.3, 0.8))
+        low, high = np.array([x + bonnet, y + 0.12, sill]), np.array([x + length - boot, y + width - 0.12, roof])
+        cabin = _Thing("car", _box(low, high, side), 0.5 * color + 0.5 * _GLASS, 0.1)
+        things += [_Thing("car", body, color, reflectance), cabin]
+        x += length + cars.choice([cars.uniform(0.6, 1.5), cars.uniform(4, 14)])
 
-def _car(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
-    length, width, sill, roof = rng.uniform((3.6, 1.65, 0.85, 1.40), (4.9, 1.85, 1.05, 1.60))
-    y = rng.uniform(_PARKING + 0.1, _KERB - width - 0.05)
-    color, reflectance = rng.choice(_CARS), rng.uniform(0.15, 0.6)
-    body = _box(np.array([x, y, 0.2]), np.array([x + length, y + width, sill]), side)
-    bonnet, boot = rng.uniform((0.8, 0.2), (1.3, 0.8))
-    low, high = np.array([x + bonnet, y + 0.12, sill]), np.array([x + length - boot, y + width - 0.12, roof])
-    cabin = _Thing("car", _box(low, high, side), 0.5 * color + 0.5 * _GLASS, 0.1)
-    gap = rng.choice([rng.uniform(0.6, 1.5), rng.uniform(4, 14)])
-    return [_Thing("car", body, color, reflectance), cabin], length + gap
+    x = start
+    while x < end:
+        radius, height = poles.uniform((0.06, 4.0), (0.18, 8.0))
+        cylinder = raycast.Cylinder(np.array([x, side * (_KERB + poles.uniform(0.4, 0.9)), 0.0]), radius, height)
+        things.append(_Thing("pole", cylinder, poles.uniform(0.2, 0.5, 3), poles.uniform(0.3, 0.7)))
+        x += poles.uniform(8, 22)
 
-
-def _pole(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
-    radius, height = rng.uniform((0.06, 4.0), (0.18, 8.0))
-    cylinder = raycast.Cylinder(np.array([x, side * (_KERB + rng.uniform(0.4, 0.9)), 0.0]), radius, height)
-    return [_Thing("pole", cylinder, rng.uniform(0.2, 0.5, 3), rng.uniform(0.3, 0.7))], rng.uniform(8, 22)
-
-
-def _bin(rng: Generator, side: int, x: float) -> tuple[list[_Thing], float]:
-    size = rng.uniform((0.4, 0.4, 0.8), (1.2, 0.7, 1.3))
-    low = np.array([x, rng.uniform(_KERB + 1.2, _FACADE - 0.9), 0.0])
-    box = _box(low, low + size, side)
-    return [_Thing("bin", box, rng.uniform(0.1, 0.6, 3), rng.uniform(0.2, 0.5))], rng.uniform(6, 25)
+    x = start
+    while x < end:
+        size = bins.uniform((0.4, 0.4, 0.8), (1.2, 0.7, 1.3))
+        low = np.array([x, bins.uniform(_KERB + 1.2, _FACADE - 0.9), 0.0])
+        box = _box(low, low + size, side)
+        things.append(_Thing("bin", box, bins.uniform(0.1, 0.6, 3), bins.uniform(0.2, 0.5)))
+        x += bins.uniform(6, 25)
+    return things
 
 
 def _into_windows(hits: raycast.Hits, things: list[_Thing]) -> tuple[raycast.Hits, Mask]:

@@ -119,11 +119,6 @@ def read_npz(file: BinaryIO, size: int) -> PointCloud:
         return cloud_of(columns)
 
 
-def is_npz_cloud(file: BinaryIO) -> bool:
-    with zipfile.ZipFile(file) as archive:
-        return "points.npy" in archive.namelist()
-
-
 def write_npz(file: BinaryIO, cloud: PointCloud) -> None:
     names = np.array(cloud.channel_names, str)
     optional: dict[str, Any] = {"covariances": cloud.covariances, "times": cloud.times}

@@ -48,7 +48,12 @@ def columns_of_floats(values: Float[np.ndarray, "n"], width: int | None = None) 
             ring = columns[4]
             if ((ring == np.rint(ring)) & (ring >= 0) & (ring < _MOST_RINGS)).all():
                 return named(columns, 3)
-    steps = {size: _step(values[:_SAMPLE], size) for size in (4, *_PERIODS)}
+    # Median difference of values that are so many columns apart.
+    sample, steps = values[:_SAMPLE], {}
+    for size in (4, *_PERIODS):
+        differences = np.abs(sample[size:] - sample[:-size])
+        finite = differences[np.isfinite(differences)]
+        steps[size] = float(np.median(finite)) if finite.size else np.inf
     columns = split(4)
     if columns is not None and _is_intensity(columns[3]) and min(steps.values()) >= _REPEATS * steps[4]:
         return named(columns, 3)
@@ -61,13 +66,6 @@ def columns_of_floats(values: Float[np.ndarray, "n"], width: int | None = None) 
         "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; "
         + (advice if fitting else f"no number of {_SIZES[0]} to {_SIZES[-1]} fills {4 * values.size} bytes")
     )
-
-
-def _step(values: Float[np.ndarray, "n"], size: int) -> float:
-    """Median difference of values that are `size` apart."""
-    differences = np.abs(values[size:] - values[:-size])
-    differences = differences[np.isfinite(differences)]
-    return float(np.median(differences)) if differences.size else np.inf
 
 
 def _is_constant(column: Float[np.ndarray, "N"]) -> bool:

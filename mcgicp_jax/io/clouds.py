@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import BinaryIO
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -52,7 +53,7 @@ FORMATS = {
     ".bin": Format(arrays.read_kitti, arrays.write_kitti),
     ".pcd.bin": Format(arrays.read_nuscenes, _not_written),
     ".npy": Format(arrays.read_npy, arrays.write_npy, arrays.is_npy_cloud),
-    ".npz": Format(arrays.read_npz, arrays.write_npz, arrays.is_npz_cloud),
+    ".npz": Format(arrays.read_npz, arrays.write_npz, lambda file: "points.npy" in ZipFile(file).namelist()),
     ".xyz": _SPACES,
     ".txt": _SPACES,
     ".csv": Format(read_text, partial(write_text, delimiter=",", mark=""), is_text_cloud),

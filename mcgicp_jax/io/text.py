@@ -72,7 +72,11 @@ def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
         comment = line.startswith(("#", "//"))
         plain = plain_numbers(line).strip("#/ \t\r\n" if comment else " \t\r\n")
         cells = [cell.strip() for cell in plain.split(_delimiter(plain))]
-        if not comment and any(cells) and all(_is_number(cell or "nan") for cell in cells):
+        try:
+            numbers = [float(cell or "nan") for cell in cells]
+        except ValueError:
+            numbers = []
+        if numbers and any(cells) and not comment:
             if len(cells) == 1 and cells[0].isdigit() and not counted:
                 counted = True
                 continue
@@ -90,14 +94,6 @@ def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
         elif not comment and any(cells):
             raise ValueError(f"expected numbers or column names with x, y, z, got {line.strip()[:60]!r}")
     raise ValueError("it has no row of numbers")
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
 
 
 def write_text(file: BinaryIO, cloud: PointCloud, delimiter: str, mark: str) -> None:

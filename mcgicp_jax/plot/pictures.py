@@ -56,30 +56,54 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         kind = type(poses).__name__
         raise ValueError(f'poses: expected poses by name, such as {{"GICP": result.matrix}}, got {kind}')
     poses = {"start": np.eye(4)} | dict(poses)
-    matrices = [pose_matrix(pose, f"poses[{name!r}]") for name, pose in poses.items()]
+    matrices = {name: pose_matrix(pose, f"poses[{name!r}]") for name, pose in poses.items()}
     source, target = drawing.drawable(source), drawing.drawable(target)
     if len(target) < 3:
         raise ValueError(f"target: expected at least 3 points, got {len(target)}")
-    moved = [np.asarray(source.transform(matrix).unpad().points) for matrix in matrices]
+    moved = {name: np.asarray(source.transform(matrix).unpad().points) for name, matrix in matrices.items()}
     source_colors, target_colors = drawing.rgb_of(source), drawing.rgb_of(target)
     target_points = np.asarray(target.points)
     view = drawing.view_onto(target_points, _PANEL_PIXELS)
+    # Picture and difference of each pose.
+    rows: dict[str, tuple[Picture, Map]] = {}
     if source_colors is not None and target_colors is not None:
-        rows = _checkerboards(view, drawing.paint(view, target_points, target_colors), moved, source_colors)
+        # Checkerboards, and the difference of smoothed colours, NaN where either cloud has no points.
+        tile = max(view.width, view.height) // _TILES + 1
+        row, column = np.mgrid[: view.height, : view.width] // tile
+        of_target = ((row + column) % 2 == 0)[..., None]
+        target_picture = drawing.paint(view, target_points, target_colors)
+        target_smooth = _smooth(target_picture)
+        for name, points in moved.items():
+            source_picture = drawing.paint(view, points, source_colors)
+            board = np.nan_to_num(np.where(of_target, target_picture, source_picture), nan=1)
+            rows[name] = board, np.abs(target_smooth - _smooth(source_picture)).mean(axis=-1)
         headings = ["target and source in alternate tiles", "detail", "difference of colour"]
     else:
         spacings = np.maximum([raw_spacing(target), raw_spacing(source)], np.finfo(float).tiny)
         target_size, source_size = np.minimum(spacings / spacings.min(), _LARGEST_POINT)
-        target_ink, rows = _ink(view, target_points, target_size), []
-        for points in moved:
+        target_ink = _ink(view, target_points, target_size)
+        for name, points in moved.items():
             source_ink = _ink(view, points, source_size)
             # Subtractive colours: the target removes all red, the source all blue, and each half of the green.
             picture = 1 - np.stack([target_ink, 0.5 * target_ink + 0.5 * source_ink, source_ink], axis=-1)
-            rows.append((picture, np.abs(target_ink - source_ink)))
+            rows[name] = picture, np.abs(target_ink - source_ink)
         headings = ["target blue, source orange, both black", "detail"]
-    detail = _where_they_differ([difference for _, difference in rows])
-    headings[1] = f"detail, {(detail[0].stop - detail[0].start) * view.pixel:.2g} m wide"
+    # The detail is the window whose summed difference varies most between the poses.
+    high, wide = (max(int(_DETAIL * side), 1) for side in (view.height, view.width))
+    sums = []
+    for _, difference in rows.values():
+        table = np.pad(np.nan_to_num(difference), ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+        across = table[:, wide:] - table[:, :-wide]
+        sums.append(across[high:] - across[:-high])
+    bottom, left = map(int, np.unravel_index(np.argmax(np.ptp(sums, axis=0)), sums[0].shape))
+    headings[1] = f"detail, {wide * view.pixel:.2g} m wide"
+    return drawing.saved(_compared(rows, headings, view, (left, left + wide, bottom, bottom + high)), path)
 
+
+def _compared(
+    rows: Mapping[str, tuple[Picture, Map]], headings: Sequence[str], view: View, detail: tuple[int, int, int, int]
+) -> Figure:
+    """Picture, detail and, if there is a third heading, difference of each pose; `detail`: left, right, bottom, top."""
     width = min(_WIDEST / len(headings), _HIGHEST * view.width / view.height)
     height = width * view.height / view.width + 0.3
     beside = -(-len(rows) // _MOST_ROWS)
@@ -90,42 +114,24 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
     for top_row in panels[::below]:
         for panel, heading in zip(top_row, headings, strict=True):
             panel.set_title(heading)
-    for row, name, (picture, difference) in zip(panels, poses, rows, strict=False):
-        _draw_row(row, name, picture, difference, detail)
+    left, right, bottom, top = detail
+    for row, (name, (picture, difference)) in zip(panels, rows.items(), strict=False):
+        # Pixel i extends from i to i + 1.
+        options = {"origin": "lower", "interpolation": "nearest", "extent": (0, view.width, 0, view.height)}
+        for panel in row[:2]:
+            panel.imshow(picture, **options)
+        row[0].plot([left, right, right, left, left], [bottom, bottom, top, top, bottom], color="black", linewidth=1)
+        row[0].set_ylabel(name, fontsize="large", fontweight="bold")
+        row[1].set(xlim=(left, right), ylim=(bottom, top))
+        if len(row) > 2:
+            row[2].imshow(difference, **options, cmap="magma", vmin=0, vmax=0.4)
+            both = np.isfinite(difference)
+            row[2].set_xlabel(f"mean {difference[both].mean():.3f}" if both.any() else "no overlap")
+        for panel in row:
+            panel.set(xticks=[], yticks=[])
     for panel in panels[len(rows) :].flat:
         panel.set_visible(False)
-    return drawing.saved(figure, path)
-
-
-def _draw_row(panels: np.ndarray, name: str, picture: Picture, difference: Map, detail: tuple[slice, slice]) -> None:
-    columns, rows = detail
-    left, right, bottom, top = columns.start, columns.stop, rows.start, rows.stop
-    # Pixel i extends from i to i + 1, in agreement with the slices.
-    options = {"origin": "lower", "interpolation": "nearest", "extent": (0, picture.shape[1], 0, picture.shape[0])}
-    for panel in panels[:2]:
-        panel.imshow(picture, **options)
-    panels[0].plot([left, right, right, left, left], [bottom, bottom, top, top, bottom], color="black", linewidth=1)
-    panels[0].set_ylabel(name, fontsize="large", fontweight="bold")
-    panels[1].set(xlim=(left, right), ylim=(bottom, top))
-    if len(panels) > 2:
-        panels[2].imshow(difference, **options, cmap="magma", vmin=0, vmax=0.4)
-        both = np.isfinite(difference)
-        panels[2].set_xlabel(f"mean {difference[both].mean():.3f}" if both.any() else "no overlap")
-    for panel in panels:
-        panel.set(xticks=[], yticks=[])
-
-
-def _checkerboards(view: View, target: Picture, moved: list[Points], colors: Points) -> list[tuple[Picture, Map]]:
-    """For each moved source a checkerboard picture, and the colour difference, NaN where either cloud has no points."""
-    tile = max(view.width, view.height) // _TILES + 1
-    row, column = np.mgrid[: view.height, : view.width] // tile
-    target_tiles = ((row + column) % 2 == 0)[..., None]
-    target_smooth, boards = _smooth(target), []
-    for points in moved:
-        source = drawing.paint(view, points, colors)
-        board = np.nan_to_num(np.where(target_tiles, target, source), nan=1)
-        boards.append((board, np.abs(target_smooth - _smooth(source)).mean(axis=-1)))
-    return boards
+    return figure
 
 
 def _smooth(picture: Picture) -> Picture:
@@ -149,19 +155,6 @@ def _ink(view: View, points: Points, size: float) -> Map:
     highest = maximum_filter(highest.reshape(view.height, view.width), round(size))
     lowest = minimum_filter(lowest.reshape(view.height, view.width), round(size))
     return np.where(highest >= lowest, np.clip((highest - lowest) / (4 * view.pixel), 0.15, 1), 0)
-
-
-def _where_they_differ(differences: Sequence[Map]) -> tuple[slice, slice]:
-    """Columns and rows of the detail: the window whose summed difference varies most between the poses."""
-    shape = np.array(differences[0].shape)
-    size = np.maximum((_DETAIL * shape).astype(int), 1)
-    sums = []
-    for difference in differences:
-        table = np.pad(np.nan_to_num(difference), ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-        across = table[:, size[1] :] - table[:, : -size[1]]
-        sums.append(across[size[0] :] - across[: -size[0]])
-    row, column = np.unravel_index(np.argmax(np.ptp(sums, axis=0)), sums[0].shape)
-    return slice(int(column), int(column + size[1])), slice(int(row), int(row + size[0]))
 
 
 def maps(
