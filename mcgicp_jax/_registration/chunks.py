@@ -291,8 +291,14 @@ def _registered(
         return loop.state, assessment, loop.history, check
 
     def on_a_device(chunk: ChunkPair, common: Any) -> Any:
-        source, target = (_with_neighbors(clouds, search, num_neighbors) for clouds in chunk[2:])
-        return Packed.of(jax.vmap(registered, (0, None))(chunk._replace(source=source, target=target), common))
+        find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)
+        for name in ("source", "target"):
+            clouds = getattr(chunk, name)
+            if clouds.deferred_neighbors is None:
+                at_a_time = max(1, _ROWS_WITH_NEIGHBORS // clouds.valid.shape[-1])
+                neighbors = jax.lax.map(find, clouds, batch_size=at_a_time)
+                chunk = chunk._replace(**{name: clouds.replace_rows(deferred_neighbors=neighbors)})
+        return Packed.of(jax.vmap(registered, (0, None))(chunk, common))
 
     common = method, robust, numbers, max_updates
     if mesh.size == 1:
@@ -301,11 +307,3 @@ def _registered(
     pairs = PartitionSpec("pairs")
     sharded = jax.shard_map(on_a_device, mesh=mesh, in_specs=(pairs, PartitionSpec()), out_specs=pairs, check_vma=False)
     return sharded(chunk, common)
-
-
-def _with_neighbors(clouds: PointCloud, search: AbstractSearch, num_neighbors: int) -> PointCloud:
-    if clouds.deferred_neighbors is not None:
-        return clouds
-    find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)
-    at_a_time = max(1, _ROWS_WITH_NEIGHBORS // clouds.valid.shape[-1])
-    return clouds.replace_rows(deferred_neighbors=jax.lax.map(find, clouds, batch_size=at_a_time))

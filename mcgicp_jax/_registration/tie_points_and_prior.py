@@ -51,36 +51,33 @@ else:
 def checked_measurements(
     tie_points: GivenTiePoints | None, prior: GivenPrior | None, source: PointCloud, target: PointCloud
 ) -> tuple[TiePoints | None, Prior | None]:
-    ties = None if tie_points is None else _centred_tie_points(tie_points, source, target)
-    return ties, None if prior is None else _centred_prior(prior, source, target)
-
-
-def _centred_tie_points(tie_points: GivenTiePoints, source: PointCloud, target: PointCloud) -> TiePoints:
-    points, targets, covariances = _parts("tie_points", tie_points, "(source_points, target_points, covariances)", 3)
-    count = np.shape(points)[0] if np.ndim(points) else 0
-    points = _numbers("tie_points: source_points", points, (count, 3))
-    targets = _numbers("tie_points: target_points", targets, (count, 3))
-    covariances = _numbers("tie_points: covariances", covariances, (count, 3, 3))
-    if is_concrete(covariances):
-        _, correlations = _correlations(covariances)
-        definite = bool(np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE)
-        _require("tie_points: covariances", correlations, definite, "positive definite")
-    return TiePoints(points - source.origin, targets - target.origin, covariances)
-
-
-def _centred_prior(prior: GivenPrior, source: PointCloud, target: PointCloud) -> Prior:
+    ties = None
+    if tie_points is not None:
+        form = "(source_points, target_points, covariances)"
+        points, targets, covariances = _parts("tie_points", tie_points, form, 3)
+        count = np.shape(points)[0] if np.ndim(points) else 0
+        points = _numbers("tie_points: source_points", points, (count, 3))
+        targets = _numbers("tie_points: target_points", targets, (count, 3))
+        covariances = _numbers("tie_points: covariances", covariances, (count, 3, 3))
+        if is_concrete(covariances):
+            _, correlations = _correlations(covariances)
+            definite = bool(np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE)
+            _require("tie_points: covariances", correlations, definite, "positive definite")
+        ties = TiePoints(points - source.origin, targets - target.origin, covariances)
+    if prior is None:
+        return ties, None
     pose, covariance = _parts("prior", prior, "(pose, covariance)", 2)
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     # The points only scale the least deviations: while they are differentiated, their values suffice.
     cloud = primal(source)
     if is_concrete(covariance, cloud.points, source.origin):
-        return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, cloud))
+        return ties, Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, cloud))
     fixed, value = None, primal(covariance)
     if is_concrete(value):
         values, rows = _principal_rows(np.asarray(value, np.float64))
         fixed = _orthonormal(rows[values <= _LEAST_EIGENVALUE])
-    return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin))
+    return ties, Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin))
 
 
 @jax.jit
