@@ -125,7 +125,16 @@ def run_pairs(
     last: dict[Any, int] = {}
     sizes: list[tuple[int, int]] = []
     for number, (key, pair) in enumerate(pairs):
-        pair = _fitted(pair, sizes)
+        rows = pair.source.valid.size, pair.target.valid.size
+        if rows not in sizes:
+            # Padded to the smallest sizes of earlier pairs that suit; without such, its own ones join them.
+            most = [max(_FEW_ROWS, 2 * count) for count in rows]
+            suitable = [size for size in sizes if all(a <= b <= c for a, b, c in zip(rows, size, most, strict=True))]
+            if suitable:
+                source, target = min(suitable, key=np.prod)
+                pair = pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
+            else:
+                sizes.append(rows)
         leaves, structure = jax.tree.flatten(pair)
         kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         if kind not in groups:
@@ -242,20 +251,6 @@ class _Group(Generic[Key]):
 def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
     """Whether there is a `doubt_of_start`, by settings and fit; None for a single `max_distance`."""
     return check is not None and doubt_of_start(start, state, check[0], lambda: check[1]) is not None
-
-
-def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
-    """The pair, padded to the smallest of the `sizes` of earlier ones that suits; without one, its own joins them."""
-    rows = pair.source.valid.size, pair.target.valid.size
-    if rows in sizes:
-        return pair
-    most = [max(_FEW_ROWS, 2 * count) for count in rows]
-    suitable = [size for size in sizes if all(a <= b <= c for a, b, c in zip(rows, size, most, strict=True))]
-    if not suitable:
-        sizes.append(rows)
-        return pair
-    source, target = min(suitable, key=np.prod)
-    return pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
 
 
 @with_settings_of_package
