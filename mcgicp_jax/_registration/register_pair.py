@@ -417,9 +417,8 @@ def _at_scales(given: Inputs, voxel_sizes: Sequence[float]) -> Iterator[Inputs]:
         yield given._replace(source=sides["source"], target=sides["target"])
         return
     for size in voxel_sizes:
-        yield given._replace(source=_smaller(given.source, size), target=_smaller(given.target, size))
+        source, target = (
+            preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1]) for cloud in given[:2]
+        )
+        yield given._replace(source=source, target=target)
     yield given
-
-
-def _smaller(cloud: PointCloud, size: float) -> PointCloud:
-    return preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1])
