@@ -83,9 +83,8 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
         rows, counts = sampled_rows(search.valid)
         # The nearest candidate of each source point alone; followed candidates are in any order.
         sampled = loop.matches.some(rows)
-        distances = executor.distances(motion, sampled)
-        first = numpy_for(distances).argmin(distances, axis=0)[None]
-        nearest = sampled._replace(indices=numpy_for(distances).take_along_axis(sampled.indices, first, axis=0))
+        first = executor.distances(motion, sampled).argmin(axis=0)[None]
+        nearest = sampled._replace(indices=numpy_for(first).take_along_axis(sampled.indices, first, axis=0))
         sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
         sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
         num_channels = xp.sum(xp.any(search.descriptors != 0, axis=0))
