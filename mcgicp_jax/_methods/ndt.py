@@ -180,7 +180,19 @@ class _Cells:
         points = _columns(cloud.coordinates if np.any(cloud.origin) else cloud.points)
         self.order, self._starts = voxel_order(grid_of(points.T).columns, voxel_size)
         if channel_size is not None:
-            self.order, self._starts = _split(self.order, self._starts, cloud, channel_size)
+            # Splits each voxel by the levels of its channels.
+            sizes = np.asarray(channel_size, np.float64)
+            if sizes.shape not in ((), (cloud.channels.shape[1],)) or not np.all(sizes > 0):
+                expected = "one positive number, or one per channel"
+                raise ValueError(f"channel_size: expected {expected}, got {channel_size!r}")
+            levels = np.floor(np.asarray(cloud.channels, np.float64)[self.order] / sizes)
+            if cloud.channel_valid is not None:
+                # Points that lack a channel get a level of their own.
+                levels = np.where(np.asarray(cloud.channel_valid)[self.order], levels, -np.inf)
+            columns = [np.cumsum(np.bincount(self._starts, minlength=len(self.order))), *levels.T]
+            by_cell = np.lexsort(columns[::-1])
+            changes = np.any([column[by_cell][1:] != column[by_cell][:-1] for column in columns], axis=0)
+            self.order, self._starts = self.order[by_cell], np.flatnonzero(np.append(True, changes))
         self.counts = np.diff(self._starts, append=len(self.order))
         points = np.take(points, self.order, axis=1)
         self.means = self._reduced(points) / self.counts
@@ -199,22 +211,6 @@ class _Cells:
 
 def _columns(rows: Shaped[AnyArray, "N D"]) -> Float[np.ndarray, "D N"]:
     return np.ascontiguousarray(np.asarray(rows).T, np.float64)
-
-
-def _split(
-    order: Int[np.ndarray, "N"], starts: Int[np.ndarray, "M"], cloud: PointCloud, channel_size: Values
-) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "M2"]]:
-    sizes = np.asarray(channel_size, np.float64)
-    if sizes.shape not in ((), (cloud.channels.shape[1],)) or not np.all(sizes > 0):
-        raise ValueError(f"channel_size: expected one positive number, or one per channel, got {channel_size!r}")
-    levels = np.floor(np.asarray(cloud.channels, np.float64)[order] / sizes)
-    if cloud.channel_valid is not None:
-        # Points that lack a channel get a level of their own.
-        levels = np.where(np.asarray(cloud.channel_valid)[order], levels, -np.inf)
-    columns = [np.cumsum(np.bincount(starts, minlength=len(order))), *levels.T]
-    by_cell = np.lexsort(columns[::-1])
-    changes = np.any([column[by_cell][1:] != column[by_cell][:-1] for column in columns], axis=0)
-    return order[by_cell], np.flatnonzero(np.append(True, changes))
 
 
 @with_settings_of_package

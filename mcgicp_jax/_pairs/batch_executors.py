@@ -6,11 +6,10 @@ from __future__ import annotations
 import collections
 import itertools
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from concurrent import futures
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
 from multiprocessing import current_process, get_context
 from pickle import PicklingError
 from typing import Any, Literal, TypeAlias
@@ -108,20 +107,17 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
 
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
     for answer in _results(fixed, sent(), executor, None):
-        results[answer.index] = _differentiable(answer, prepared[answer.index])
+        ready = prepared[answer.index]
+        result = ready.checked(answer.registration)
+        if answer.jacobian:
+            values, inputs = [np.asarray(result.centred.wxyz_xyz)], [ready.leaves[i] for i in ready.traced]
+            (pose,) = with_derivative(values, KnownJacobian(answer.jacobian), inputs)
+            origins = ready.inputs.source.origin, ready.inputs.target.origin
+            if is_concrete(origins):
+                origins = result.source_origin, result.target_origin
+            result = result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
+        results[answer.index] = result
     return [results[index] for index in sorted(results)]
-
-
-def _differentiable(answer: PairResult, pair: PreparedPair) -> RegistrationResult:
-    result = pair.checked(answer.registration)
-    if not answer.jacobian:
-        return result
-    values, inputs = [np.asarray(result.centred.wxyz_xyz)], [pair.leaves[i] for i in pair.traced]
-    (pose,) = with_derivative(values, KnownJacobian(answer.jacobian), inputs)
-    origins = pair.inputs.source.origin, pair.inputs.target.origin
-    if is_concrete(origins):
-        origins = result.source_origin, result.target_origin
-    return result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
 
 
 def _results(job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None) -> Iterator[PairResult]:
@@ -158,7 +154,12 @@ def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int 
 
     def until_processes_run() -> Iterator[Pair]:
         nonlocal rest
-        while (pair := start.waited_for(partial(next, pairs, None))) is not None:
+        while True:
+            begin = time.perf_counter()
+            pair = next(pairs, None)
+            start.idle += time.perf_counter() - begin
+            if pair is None:
+                return
             if start.has_ended(pair):
                 rest = itertools.chain([pair], pairs)
                 return
@@ -199,20 +200,18 @@ class _Start:
         # Workers of other pools have their cores to themselves.
         self._possible = self._num_workers > 1 and current_process().name == "MainProcess"
 
-    def waited_for(self, make: Callable[[], Pair | None]) -> Pair | None:
-        begin = time.perf_counter()
-        try:
-            return make()
-        finally:
-            self.idle += time.perf_counter() - begin
-
     def has_ended(self, pair: Pair) -> bool:
         """Whether the processes run; starts them if they pay and can be sent the next pair."""
         if not self._possible:
             return False
         try:
             if self._first is None and self._pays(pair):
-                self._begin(pair)
+                text = "register_batch: %d processes start, and take over from threads once they run"
+                LOGGER.info(text, self._num_workers)
+                processes = Processes(self._num_workers)
+                receive = with_settings(_as_numpy(self._job).received, pickled=True)
+                self._first = processes.submit(receive, _as_numpy(pair))
+                self.processes = processes
             if self._first is None or not self._first.done():
                 return False
             self._first.result()
@@ -221,12 +220,6 @@ class _Start:
             LOGGER.info("register_batch: pairs stay in threads; %s", _words(error))
             self._possible, self.processes = False, None
         return self._possible
-
-    def _begin(self, pair: Pair) -> None:
-        LOGGER.info("register_batch: %d processes start, and take over from threads once they run", self._num_workers)
-        processes = Processes(self._num_workers)
-        self._first = processes.submit(with_settings(_as_numpy(self._job).received, pickled=True), _as_numpy(pair))
-        self.processes = processes
 
     def _pays(self, pair: Pair) -> bool:
         now = time.perf_counter() - self.idle
@@ -316,9 +309,11 @@ class ChunkedExecutor:
                 elif isinstance(error, PicklingError) and self._at_home is not None:
                     results = self._at_home.register_chunk(chunk)
                 elif isinstance(error, PicklingError):
+                    # The message of the error in loky's thread, whose traceback is the text of the cause.
+                    lines = [line for line in str(error.__cause__ or error).splitlines() if line.strip(' "')]
                     raise ValueError(
                         f"pairs {chunk[0].index} to {chunk[-1].index}: expected clouds and functions that can be sent "
-                        f"to other processes; {_reason(error)}"
+                        f"to other processes; {lines[-1] if lines else type(error).__name__}"
                     ) from error
                 else:
                     # A worker that dies breaks its pool, and so all chunks that were submitted.
@@ -337,12 +332,6 @@ def _as_numpy(sent: Any) -> Any:
         return np.asarray(value) if isinstance(value, jax.Array) else value
 
     return replace(sent, **jax.tree.map(convert, dict(vars(sent)), is_leaf=is_deferred))
-
-
-def _reason(error: PicklingError) -> str:
-    """The message of the error in loky's thread, whose traceback is the text of the cause."""
-    lines = [line for line in str(error.__cause__ or error).splitlines() if line.strip(' "')]
-    return lines[-1] if lines else type(error).__name__
 
 
 def _words(error: BaseException) -> str:

@@ -357,21 +357,17 @@ def _read(clouds: dict[str, Cloud]) -> dict[str, PointCloud]:
     for name, cloud in clouds.items():
         if callable(cloud) and not isinstance(cloud, PointCloud):
             with messages_named(name):
-                cloud = _loaded(cloud)
+                try:
+                    cloud = cloud()
+                except (ValueError, OSError):
+                    raise
+                # `sys.exit` in the reader of one cloud must not end the batch.
+                except (Exception, SystemExit) as error:
+                    place = traceback.extract_tb(error.__traceback__)[-1]
+                    reason = f"{type(error).__name__}: {error}".rstrip(": ")
+                    raise ValueError(f"{reason} ({place.filename}, line {place.lineno})") from error
         sides[name] = as_cloud(name, cloud)
     return sides
-
-
-def _loaded(load: Callable[[], PointCloud | Values]) -> PointCloud | Values:
-    try:
-        return load()
-    except (ValueError, OSError):
-        raise
-    # `sys.exit` in the reader of one cloud must not end the batch.
-    except (Exception, SystemExit) as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        reason = f"{type(error).__name__}: {error}".rstrip(": ")
-        raise ValueError(f"{reason} ({place.filename}, line {place.lineno})") from error
 
 
 def _computed_ahead(

@@ -65,7 +65,8 @@ class NoiseSample(NamedTuple):
 def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
     """The statistics of matches whose surfaces have `noise` and `search`."""
     source, target = matched.source, matched.target
-    noises, rows = _noises(matched), (searched(source), searched(target))
+    noises = cast(SurfaceNoise, source.noise), cast(SurfaceNoise, target.noise)
+    rows = searched(source), searched(target)
     residual = target.points.T - motion.move(source.points)
     across = jnp.dot(motion.rotation, noises[0].normal.T, precision="highest")
     expected = noises[0].roughness + noises[1].roughness
@@ -79,10 +80,6 @@ def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
     radius = 0.5 * (noises[0].neighborhood_radius + noises[1].neighborhood_radius)
     columns = alg.inner(across, residual) ** 2, expected, quotient, radius
     return NoiseSample(*(jnp.where(matched.valid, column, jnp.nan) for column in columns))
-
-
-def _noises(matched: Matched) -> tuple[SurfaceNoise, SurfaceNoise]:
-    return cast(SurfaceNoise, matched.source.noise), cast(SurfaceNoise, matched.target.noise)
 
 
 def discounts_and_radius(
@@ -155,7 +152,7 @@ def scores_of(
     bias, cells, stiffness = jnp.zeros(6, moved.dtype), None, total.stiffness
     if matched.source.noise is not None:
         edge = max(term.correlation_length for term in (responding or terms))
-        source, target = _noises(matched)
+        source, target = cast(SurfaceNoise, matched.source.noise), cast(SurfaceNoise, matched.target.noise)
         # In units of the data about their centre, so that cells do not depend on the unit of length or on the origin.
         relative = 0.5 * (source.neighborhood_radius + target.neighborhood_radius) / frame.neighborhood_radius
         per_radius = jnp.maximum(frame.radius / (edge * frame.neighborhood_radius), _LEAST_CELLS)
@@ -168,7 +165,13 @@ def scores_of(
         stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, total.force - seen.force), axis=1)
     else:
         if any(term.robust is not None for term in terms):
-            stiffness = _tangent_stiffness(posed, counts, terms)
+            # The symmetric part of −∂f/∂(T a), which includes the decrease of w with the residual.
+            def force_at(shift: Float[Array, "3"]) -> Float[Array, "3 N"]:
+                return linearize(terms, posed._replace(moved=moved + shift[:, None])).force
+
+            still = jnp.zeros(3, moved.dtype)
+            columns = [-counts * jax.jvp(force_at, (still,), (axis,))[1] for axis in jnp.eye(3, dtype=still.dtype)]
+            stiffness = jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
         if matched.source.noise is not None:
             shown = _discounted_observability(posed, frame.discount, terms)
             left_out = total.force - alg.multiply(total.stiffness, alg.multiply(shown, total.residual))
@@ -197,19 +200,6 @@ def _discounted_observability(
 
 def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
     return jnp.concatenate([force, jnp.cross(arms, force, axis=0)])
-
-
-def _tangent_stiffness(
-    posed: PosedMatches, counts: Float[Array, "N"], terms: tuple[AbstractTerm, ...]
-) -> Float[Array, "6 N"]:
-    """−∂f/∂(T a) of robust correspondences, symmetrised: includes the decrease of w with the residual."""
-
-    def force(shift: Float[Array, "3"]) -> Float[Array, "3 N"]:
-        return linearize(terms, posed._replace(moved=posed.moved + shift[:, None])).force
-
-    still = jnp.zeros(3, posed.moved.dtype)
-    columns = [-counts * jax.jvp(force, (still,), (axis,))[1] for axis in jnp.eye(3, dtype=still.dtype)]
-    return jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
 
 
 class Moments(NamedTuple):

@@ -190,33 +190,26 @@ def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirec
     radius = np.asarray(directions.radius)
     # Motion of the centroid, and by rotation about it, both in metres of rms motion.
     motions = np.concatenate([twists[:, :3] + np.cross(twists[:, 3:], center), radius * twists[:, 3:]], axis=1)
-
-    def named(motion: Float[np.ndarray, "6"], by_channels: bool, by_ties: bool) -> UnconstrainedDirection:
-        turning = bool(np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion))
-        axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
-        twist = np.concatenate([motion[:3] - np.cross(omega, center), omega])
-        return UnconstrainedDirection(twist, by_channels, axis / np.linalg.norm(axis), turning, by_ties)
-
     unconstrained: list[UnconstrainedDirection] = []
     for by_channels, by_ties in ((False, False), (False, True), (True, False)):
         group = motions[free & (by_matches == by_channels) & ((constrained & ~by_matches) == by_ties)]
-        unconstrained += [named(motion, by_channels, by_ties) for motion in _separate(group) @ group]
+        if not len(group):
+            continue
+        # An orthogonal matrix mixes motions so that translations come first, along coordinate axes where possible.
+        # Motions stay orthogonal in the mean motion of the points.
+        mixing = np.linalg.svd(group[:, 3:])[0].T[::-1]
+        ordered = mixing @ group
+        flat = np.linalg.norm(ordered[:, 3:], axis=1) <= _PURE * np.linalg.norm(ordered, axis=1)
+        if flat.sum() == 2:
+            along = np.argmax(np.linalg.norm(ordered[flat, :3], axis=0))
+            cosine, sine = ordered[flat, along] / np.linalg.norm(ordered[flat, along])
+            mixing[flat] = np.array([[cosine, sine], [-sine, cosine]]) @ mixing[flat]
+        for motion in mixing @ group:
+            turning = bool(np.linalg.norm(motion[3:]) > _PURE * np.linalg.norm(motion))
+            axis, omega = motion[3:] if turning else motion[:3], motion[3:] / radius
+            twist, axis = np.concatenate([motion[:3] - np.cross(omega, center), omega]), axis / np.linalg.norm(axis)
+            unconstrained.append(UnconstrainedDirection(twist, by_channels, axis, turning, by_ties))
     return tuple(unconstrained)
-
-
-def _separate(motions: Float[np.ndarray, "m 6"]) -> Float[np.ndarray, "m m"]:
-    """Orthogonal matrix that mixes motions so that translations come first, along coordinate axes where possible.
-    Motions stay orthogonal in the mean motion of the points."""
-    if not len(motions):
-        return np.zeros((0, 0))
-    mixing = np.linalg.svd(motions[:, 3:])[0].T[::-1]
-    ordered = mixing @ motions
-    flat = np.linalg.norm(ordered[:, 3:], axis=1) <= _PURE * np.linalg.norm(ordered, axis=1)
-    if flat.sum() == 2:
-        axis = np.argmax(np.linalg.norm(ordered[flat, :3], axis=0))
-        cosine, sine = ordered[flat, axis] / np.linalg.norm(ordered[flat, axis])
-        mixing[flat] = np.array([[cosine, sine], [-sine, cosine]]) @ mixing[flat]
-    return mixing
 
 
 def as_text(directions: Sequence[UnconstrainedDirection]) -> str:

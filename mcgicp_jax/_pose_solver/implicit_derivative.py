@@ -18,7 +18,6 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import parameters_by_twist, units
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
 from mcgicp_jax._pose_solver.pose_measurements import Fusion
-from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._terms.base import AbstractTerm
 
 # Iteration limit. Newton's method, which starts at the pose of the loop and converges quadratically, takes 3 or 4.
@@ -55,26 +54,6 @@ class ImplicitRoot(eqx.Module):
         """Pᵀ (∂g/∂ξ) P, with 1 on the diagonal for unconstrained directions, so that it has an inverse."""
         xp = numpy_for(slope)
         return self.rows @ slope @ self.columns + xp.diag(1.0 * ~xp.any(self.rows, axis=1))
-
-
-def root_near(
-    sums: Sums,
-    usable: Bool[Array, ""],
-    basis: Float[AnyArray, "6 6"],
-    constrained: Bool[AnyArray, "6"],
-    fusion: Fusion | None,
-) -> ImplicitRoot:
-    """The scaling of g at the returned pose; columns of `basis` are twists, lengths in units of the radius."""
-    identity, degenerate = jnp.eye(6, dtype=sums.center.dtype), usable & ~jnp.all(constrained)
-    columns = jnp.where(degenerate, basis * constrained, identity)
-    if fusion is not None:
-        radius, rows = jnp.asarray(fusion.radius), jnp.where(degenerate, jnp.diag(1.0 * constrained), identity)
-        return ImplicitRoot(jnp.asarray(fusion.center), radius, radius, usable, columns, rows)
-    radius = jnp.where(usable, sums.radius, 1)
-    # The trace of Σ K, in the unit of g.
-    scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 3, 3]) * radius**2
-    center, scale = jnp.where(usable, sums.center, 0), jnp.where(usable, scale, 1)
-    return ImplicitRoot(center, radius, scale, usable, columns, columns.T)
 
 
 class Model(NamedTuple):

@@ -152,17 +152,14 @@ def matched_rows(rows: Sequence[Rows], temperature: Float[AnyScalar, ""] | None 
     """Matches from rows gathered from `inputs_of`; the index in the target is −1 for correspondences to ignore."""
     index = rows[1].index
     count = len(index) if index.ndim == 2 else 1
-
-    def tiled(tree: Any) -> Any:
-        return jax.tree.map(lambda rows: jnp.tile(rows, (count, *[1] * (rows.ndim - 1))), tree)
-
-    def flat(tree: Any) -> Any:
-        return jax.tree.map(lambda rows: rows.reshape(index.size, *rows.shape[index.ndim :]), tree)
-
-    sides = [tiled(part.tree) for part in rows[::2]], [flat(part.tree) for part in rows[1::2]]
+    # Each source point once for each of its candidates.
+    repeated = [part.tree for part in rows[::2]]
+    repeated = jax.tree.map(lambda leaf: jnp.tile(leaf, (count, *[1] * (leaf.ndim - 1))), repeated)
+    candidates = [part.tree for part in rows[1::2]]
+    candidates = jax.tree.map(lambda leaf: leaf.reshape(index.size, *leaf.shape[index.ndim :]), candidates)
     source, target = (
         surface._replace(**{"noise" if isinstance(part, SurfaceNoise) else "search": part for part in parts})
-        for surface, *parts in sides
+        for surface, *parts in (repeated, candidates)
     )
     descriptor_distances = None
     if temperature is not None:
@@ -194,15 +191,12 @@ def linearize_at(
     if matched.temperature is not None and matched.descriptor_distances is not None:
         square = alg.inner(total.residual, total.residual) + matched.descriptor_distances
         shape = (matched.num_candidates, -1)
-        counts = _softmax((-0.5 * square / matched.temperature**2).reshape(shape), matched.valid.reshape(shape))
+        # Softmax over the valid candidates of each source point.
+        logits, valid = (-0.5 * square / matched.temperature**2).reshape(shape), matched.valid.reshape(shape)
+        highest = jax.lax.stop_gradient(jnp.max(jnp.where(valid, logits, -jnp.inf), axis=0))
+        shifted = jnp.where(valid, logits - jnp.where(jnp.isfinite(highest), highest, 0), 0)
+        counts = normalized(jnp.where(valid, jnp.exp(shifted), 0))
     return posed, total.scaled(counts), counts
-
-
-def _softmax(logits: Float[Array, "m N"], valid: Bool[Array, "m N"]) -> Float[Array, "n"]:
-    """Softmax over the valid candidates of each source point."""
-    highest = jax.lax.stop_gradient(jnp.max(jnp.where(valid, logits, -jnp.inf), axis=0))
-    shifted = jnp.where(valid, logits - jnp.where(jnp.isfinite(highest), highest, 0), 0)
-    return normalized(jnp.where(valid, jnp.exp(shifted), 0))
 
 
 def normalized(weights: Float[Array, "m N"]) -> Float[Array, "n"]:

@@ -110,12 +110,17 @@ def sums_of(
     center = jnp.stack(position) / jnp.maximum(count, 1)
     h = with_one(mask * (posed.moved - center[:, None]))
     share = normalized(counts.reshape(matched.num_candidates, -1))
+    first = mask
+    if matched.num_candidates > 1:
+        # 1 for the first valid candidate of each source point.
+        by_candidate = mask.reshape(matched.num_candidates, -1)
+        first = jnp.where(jnp.cumsum(by_candidate, axis=0) == 1, by_candidate, 0).reshape(-1)
     numbers = [
         mask,
         alg.inner(total.residual, total.force),
         total.cost,
         share * alg.inner(total.residual, total.residual),
-        _first_of_each(mask, matched.num_candidates),
+        first,
     ]
     rows = {"stiffness": total.stiffness, "force": total.force, "numbers": jnp.stack(numbers)}
     fractions = observability(posed, terms, last)
@@ -158,14 +163,6 @@ def moments_about(rows: Float[Array, "R n"], h: Float[Array, "4 n"]) -> Float[Ar
     h = jax.lax.optimization_barrier(h)
     products = (h[:, None] * h[None]).reshape(16, -1)
     return jnp.dot(rows, products.T, precision="highest").reshape(-1, 4, 4)
-
-
-def _first_of_each(mask: Float[Array, "n"], num_candidates: int) -> Float[Array, "n"]:
-    """1 for the first valid candidate of each source point."""
-    if num_candidates == 1:
-        return mask
-    by_candidate = mask.reshape(num_candidates, -1)
-    return jnp.where(jnp.cumsum(by_candidate, axis=0) == 1, by_candidate, 0).reshape(-1)
 
 
 def observability(

@@ -73,7 +73,17 @@ def solve_update(
     roots, pivots = jax.vmap(_semidefinite_root)(jnp.stack([form * scale, padded]))
     # optimistix keeps its step sizes in the default precision, and fails on float32 data where x64 is on.
     root, columns = roots[0].astype(float), basis.astype(float)
-    twist = basis @ _least_squares(root, columns).value.astype(dtype)
+    # The residuals are sums of terms up to √_HESSIAN_SCALE = 100 and rounded accordingly: with a smaller tolerance the
+    # steps would never fall below it.
+    tolerance = 64 * float(jnp.finfo(root.dtype).eps)
+    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
+        rtol=tolerance, atol=tolerance, linear_solver=_NormalEquations()
+    )
+    solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion(solver.search))
+    solution: optx.Solution = optx.least_squares(
+        _residuals, solver, jnp.zeros(6), (root, columns), max_steps=_MAX_STEPS, throw=False
+    )
+    twist = basis @ solution.value.astype(dtype)
     # θ a from 2 s, see `_residuals`.
     square = 0.25 * (twist[3:] @ twist[3:])
     turned = square > 0
@@ -89,17 +99,6 @@ def solve_update(
 def rounding(diagonal: Float[Array, "6"]) -> Float[Array, ""]:
     """Pivots or eigenvalues of an information matrix up to this one are rounding; from its diagonal or eigenvalues."""
     return 64 * jnp.finfo(diagonal.dtype).eps * jnp.max(diagonal)
-
-
-def _least_squares(root: Float[Array, "13 13"], basis: Float[Array, "6 6"]) -> optx.Solution:
-    # The residuals are sums of terms up to √_HESSIAN_SCALE = 100 and rounded accordingly: with a smaller tolerance the
-    # steps would never fall below it.
-    tolerance = 64 * float(jnp.finfo(root.dtype).eps)
-    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
-        rtol=tolerance, atol=tolerance, linear_solver=_NormalEquations()
-    )
-    solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion(solver.search))
-    return optx.least_squares(_residuals, solver, jnp.zeros(6), (root, basis), max_steps=_MAX_STEPS, throw=False)
 
 
 class _NormalEquations(lx.AbstractLinearSolver):

@@ -81,47 +81,45 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     frame = Frame(state.sums.center, state.sums.radius, np.tile(one, 2), one, num_cells)
     if problem.source.observed:
         rows, counts = sampled_rows(search.valid)
-        nearest = executor.nearest_candidates(motion, loop.matches.some(rows))
+        # The nearest candidate of each source point alone; followed candidates are in any order.
+        sampled = loop.matches.some(rows)
+        first = executor.distances(motion, sampled).argmin(axis=0)[None]
+        nearest = sampled._replace(indices=numpy_for(first).take_along_axis(sampled.indices, first, axis=0))
         sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
         sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
         num_channels = xp.sum(xp.any(search.descriptors != 0, axis=0))
         discount, neighborhood_radius = discounts_and_radius(sample, num_channels)
         frame = frame._replace(discount=discount, neighborhood_radius=neighborhood_radius)
+    responding = None
     # Fixed matches do not respond to a motion.
-    responding = _responding(executor, loop) if problem.matches is None and is_adaptive(loop.terms) else None
+    if problem.matches is None and is_adaptive(loop.terms):
+        responding = tuple(_with_response(term, executor, loop) for term in loop.terms)
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
     ours, theirs = problem.settings.rounding
     rounding = (motion.rotation * ours) @ motion.rotation.T + numpy_for(theirs).diag(theirs)
     return moments_from(scores, search.valid.size)._replace(rounding=rounding)
 
 
-def _responding(executor: AbstractExecutor, loop: LoopResult) -> tuple[AbstractTerm, ...]:
-    """The terms with their response, from a sample of the source points that is shifted and matched anew."""
+def _with_response(term: AbstractTerm, executor: AbstractExecutor, loop: LoopResult) -> AbstractTerm:
+    """An adaptive term with its response, from a sample of the source points that is shifted and matched anew."""
+    if not isinstance(term, AbstractAdaptiveTerm):
+        return term
     rows, counts = sampled_rows(executor.problem.source.search.valid)
 
-    def responding(term: AbstractTerm) -> AbstractTerm:
-        if not isinstance(term, AbstractAdaptiveTerm):
-            return term
+    def sample(shift: Float[AnyArray, "3"]) -> Any:
+        return executor.rows(sample_of_term, *executor.rematched(loop.state.pose, shift, rows, counts), term)
 
-        def sample(shift: Float[AnyArray, "3"]) -> Any:
-            return executor.rows(sample_of_term, *executor.rematched(loop.state.pose, shift, rows, counts), term)
-
+    with np.errstate(over="ignore", invalid="ignore"):
         if is_concrete(term.shifts):
             samples = jax.tree.map(lambda *results: np.stack(results), *map(sample, np.asarray(term.shifts)))
         else:
             samples = jax.lax.map(sample, term.shifts)
         return term.with_response(samples)
 
-    with np.errstate(over="ignore", invalid="ignore"):
-        return tuple(map(responding, loop.terms))
-
 
 def as_float64(tree: Any) -> Any:
-    def convert(leaf: Any) -> np.ndarray:
-        array = np.asarray(leaf)
-        return array.astype(np.float64) if array.dtype == np.float32 else array
-
-    return jax.tree.map(convert, tree)
+    arrays = jax.tree.map(np.asarray, tree)
+    return jax.tree.map(lambda array: array.astype(np.float64) if array.dtype == np.float32 else array, arrays)
 
 
 def constraints_of(state: State) -> Constraints:

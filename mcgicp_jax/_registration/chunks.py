@@ -125,7 +125,16 @@ def run_pairs(
     last: dict[Any, int] = {}
     sizes: list[tuple[int, int]] = []
     for number, (key, pair) in enumerate(pairs):
-        pair = _fitted(pair, sizes)
+        rows = pair.source.valid.size, pair.target.valid.size
+        if rows not in sizes:
+            # Padded to the smallest sizes of earlier pairs that suit; without such, its own ones join them.
+            most = [max(_FEW_ROWS, 2 * count) for count in rows]
+            suitable = [size for size in sizes if all(a <= b <= c for a, b, c in zip(rows, size, most, strict=True))]
+            if suitable:
+                source, target = min(suitable, key=np.prod)
+                pair = pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
+            else:
+                sizes.append(rows)
         leaves, structure = jax.tree.flatten(pair)
         kind = structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         if kind not in groups:
@@ -244,20 +253,6 @@ def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
     return check is not None and doubt_of_start(start, state, check[0], lambda: check[1]) is not None
 
 
-def _fitted(pair: ChunkPair, sizes: list[tuple[int, int]]) -> ChunkPair:
-    """The pair, padded to the smallest of the `sizes` of earlier ones that suits; without one, its own joins them."""
-    rows = pair.source.valid.size, pair.target.valid.size
-    if rows in sizes:
-        return pair
-    most = [max(_FEW_ROWS, 2 * count) for count in rows]
-    suitable = [size for size in sizes if all(a <= b <= c for a, b, c in zip(rows, size, most, strict=True))]
-    if not suitable:
-        sizes.append(rows)
-        return pair
-    source, target = min(suitable, key=np.prod)
-    return pair._replace(source=pair.source.pad(source), target=pair.target.pad(target))
-
-
 @with_settings_of_package
 @partial(jax.jit, static_argnames=("options", "num_neighbors", "covariances", "mesh"))
 def _registered(
@@ -291,8 +286,14 @@ def _registered(
         return loop.state, assessment, loop.history, check
 
     def on_a_device(chunk: ChunkPair, common: Any) -> Any:
-        source, target = (_with_neighbors(clouds, search, num_neighbors) for clouds in chunk[2:])
-        return Packed.of(jax.vmap(registered, (0, None))(chunk._replace(source=source, target=target), common))
+        find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)
+        for name in ("source", "target"):
+            clouds = getattr(chunk, name)
+            if clouds.deferred_neighbors is None:
+                at_a_time = max(1, _ROWS_WITH_NEIGHBORS // clouds.valid.shape[-1])
+                neighbors = jax.lax.map(find, clouds, batch_size=at_a_time)
+                chunk = chunk._replace(**{name: clouds.replace_rows(deferred_neighbors=neighbors)})
+        return Packed.of(jax.vmap(registered, (0, None))(chunk, common))
 
     common = method, robust, numbers, max_updates
     if mesh.size == 1:
@@ -301,11 +302,3 @@ def _registered(
     pairs = PartitionSpec("pairs")
     sharded = jax.shard_map(on_a_device, mesh=mesh, in_specs=(pairs, PartitionSpec()), out_specs=pairs, check_vma=False)
     return sharded(chunk, common)
-
-
-def _with_neighbors(clouds: PointCloud, search: AbstractSearch, num_neighbors: int) -> PointCloud:
-    if clouds.deferred_neighbors is not None:
-        return clouds
-    find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)
-    at_a_time = max(1, _ROWS_WITH_NEIGHBORS // clouds.valid.shape[-1])
-    return clouds.replace_rows(deferred_neighbors=jax.lax.map(find, clouds, batch_size=at_a_time))

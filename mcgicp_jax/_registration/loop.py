@@ -34,7 +34,7 @@ from mcgicp_jax._methods.surfaces import AnySurface
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import first_force, fused_update
-from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot, root_near
+from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot
 from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, sample_of_term
 from mcgicp_jax._pose_solver.pose_measurements import (
     Fusion,
@@ -257,13 +257,6 @@ class AbstractExecutor(abc.ABC):
             residual = targets[xp.maximum(matches.indices, 0)] - moved
             return xp.where(matches.indices >= 0, xp.linalg.norm(residual, axis=-1), np.inf)
 
-    def nearest_candidates(self, motion: Motion, matches: Matches) -> Matches:
-        """The nearest candidate of each source point alone. Followed candidates are in any order."""
-        distances = self.distances(motion, matches)
-        xp = numpy_for(distances)
-        first = xp.argmin(distances, axis=0)[None]
-        return matches._replace(indices=xp.take_along_axis(matches.indices, first, axis=0))
-
     def differentiable_matches(self, loop: LoopResult) -> Matches:
         """The matches by which the final pose is differentiated: those of the loop, or soft ones at this pose."""
         problem, pose, matches = self.problem, loop.state.pose.wxyz_xyz, loop.matches
@@ -382,6 +375,7 @@ def squares_from_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) 
 
 def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     """The equation that defines the final pose, for its derivative."""
+    sums = state.sums
     converged = (state.status == Status.CONVERGED) | (state.status == Status.UNVERIFIED)
     usable = converged | (state.status == Status.DEGENERATE) | (state.status == Status.MAX_ITERATIONS)
     if fusion is not None:
@@ -391,4 +385,13 @@ def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
     else:
         values, basis = jnp.linalg.eigh(state.information)
         constrained = converged | (values > rounding(values))
-    return root_near(state.sums, usable, basis, constrained, fusion)
+    identity, degenerate = jnp.eye(6, dtype=sums.center.dtype), usable & ~jnp.all(constrained)
+    columns = jnp.where(degenerate, basis * constrained, identity)
+    if fusion is not None:
+        radius, rows = jnp.asarray(fusion.radius), jnp.where(degenerate, jnp.diag(1.0 * constrained), identity)
+        return ImplicitRoot(jnp.asarray(fusion.center), radius, radius, usable, columns, rows)
+    radius = jnp.where(usable, sums.radius, 1)
+    # The trace of Σ K, in the unit of g.
+    scale = jnp.sum(sums.stiffness[jnp.array([0, 3, 5]), 3, 3]) * radius**2
+    center, scale = jnp.where(usable, sums.center, 0), jnp.where(usable, scale, 1)
+    return ImplicitRoot(center, radius, scale, usable, columns, columns.T)

@@ -54,12 +54,22 @@ class Options:
     def __post_init__(self) -> None:
         for name, number in self.numbers.items():
             object.__setattr__(self, name, primal(number))
-        if self.max_distance is not None:
-            _check_distances(self.max_distance)
+        distances: Any = self.max_distance
+        if distances is not None and np.shape(distances) != (2,):
+            check_positive("max_distance", distances, "one or two positive numbers")
+        elif distances is not None and is_concrete(distances):
+            coarse, fine = distances
+            if not (is_number(coarse) and is_number(fine) and coarse >= fine > 0):
+                raise ValueError(
+                    f"max_distance: expected two positive numbers, the larger one first, got {distances!r}"
+                )
         check_integer("max_iterations", self.max_iterations, 1)
-        if self.translation_tolerance is not None:
-            _check_tolerance("translation_tolerance", self.translation_tolerance)
-        _check_tolerance("rotation_tolerance", self.rotation_tolerance)
+        for name in ("translation_tolerance", "rotation_tolerance"):
+            value = getattr(self, name)
+            if name == "translation_tolerance" and value is None:
+                continue
+            if is_concrete(value) and not (is_number(value) and np.asarray(value) >= 0):
+                raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
         for name, kind, example in (
             ("robust", AbstractKernel, "Huber(1.0)"),
             ("search", AbstractSearch, "KDTreeSearch()"),
@@ -139,17 +149,3 @@ def check_method(method: AbstractMethod) -> None:
     if not isinstance(method, AbstractMethod):
         order = "; is the order right? Clouds come first" if isinstance(method, PointCloud | np.ndarray) else ""
         raise ValueError(f"method: expected a method such as MultiChannelGICP(), got {reprlib.repr(method)}{order}")
-
-
-def _check_tolerance(name: str, value: Any) -> None:
-    if is_concrete(value) and not (is_number(value) and np.asarray(value) >= 0):
-        raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
-
-
-def _check_distances(distances: Any) -> None:
-    if np.shape(distances) != (2,):
-        check_positive("max_distance", distances, "one or two positive numbers")
-    elif is_concrete(distances):
-        coarse, fine = distances
-        if not (is_number(coarse) and is_number(fine) and coarse >= fine > 0):
-            raise ValueError(f"max_distance: expected two positive numbers, the larger one first, got {distances!r}")

@@ -260,7 +260,7 @@ def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: 
     return derivative if derivative.arrays else None
 
 
-def _as_registered(given: Inputs, inputs: Inputs, channels: Any = None) -> Inputs:
+def _as_registered(given: Inputs, inputs: Inputs, channels: Any) -> Inputs:
     """What is given, with what the registration has chosen, and with equalised channels of the source, if any."""
     source = given.source if channels is None else given.source.replace_rows(channels=channels)
     method = with_unset_from(given.method, inputs.method)

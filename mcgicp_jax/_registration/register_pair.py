@@ -399,30 +399,26 @@ def _at_scales(given: Inputs, voxel_sizes: Sequence[float]) -> Iterator[Inputs]:
     method, sides = given.method, {"source": given.source, "target": given.target}
     if method.needs_covariances and len(voxel_sizes):
         for size in voxel_sizes[:-1]:
-            source, target = (_in_voxels(name, cloud, _COARSE_VOXEL * size) for name, cloud in sides.items())
-            yield given._replace(source=source, target=target, method=GICP())
-        sides |= {name: _in_cells(name, sides[name], voxel_sizes[-1], method) for name in method.needs_covariances}
+            voxels = dict[str, PointCloud]()
+            for name, cloud in sides.items():
+                with messages_named(name):
+                    voxels[name] = with_neighbors(finite_rows(cloud), _COARSE_VOXEL * size, NUM_NEIGHBORS)
+            yield given._replace(source=voxels["source"], target=voxels["target"], method=GICP())
+        size = voxel_sizes[-1]
+        for name in method.needs_covariances:
+            channel_size: Any = None
+            if method.uses_channels:
+                # A cell extends as far in α · channel as in position.
+                with np.errstate(divide="ignore"):
+                    weights = method.weights(sides[name].channels.shape[1])
+                    channel_size = size / np.asarray(weights, np.float64)
+            with messages_named(name):
+                sides[name] = voxel_gaussians(sides[name], size, channel_size=channel_size)
         yield given._replace(source=sides["source"], target=sides["target"])
         return
     for size in voxel_sizes:
-        yield given._replace(source=_smaller(given.source, size), target=_smaller(given.target, size))
+        source, target = (
+            preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1]) for cloud in given[:2]
+        )
+        yield given._replace(source=source, target=target)
     yield given
-
-
-def _in_cells(name: str, cloud: PointCloud, size: float, method: AbstractMethod) -> PointCloud:
-    channel_size: Any = None
-    if method.uses_channels:
-        # A cell extends as far in α · channel as in position.
-        with np.errstate(divide="ignore"):
-            channel_size = size / np.asarray(method.weights(cloud.channels.shape[1]), np.float64)
-    with messages_named(name):
-        return voxel_gaussians(cloud, size, channel_size=channel_size)
-
-
-def _in_voxels(name: str, cloud: PointCloud, size: float) -> PointCloud:
-    with messages_named(name):
-        return with_neighbors(finite_rows(cloud), size, NUM_NEIGHBORS)
-
-
-def _smaller(cloud: PointCloud, size: float) -> PointCloud:
-    return preprocess(cloud, size, check_neighbors(cloud, numpy_for(cloud)).shape[-1])

@@ -97,15 +97,6 @@ def default_distances(spacing: Any, target: PointCloud) -> tuple[Any, Any]:
     return _COARSE_SPACINGS * numpy_for(spacing, between).maximum(spacing, between), _FINE_SPACINGS * spacing
 
 
-def _median_range(source: PointCloud) -> Float[AnyScalar, ""]:
-    """Median distance of the points from the sensor, the origin of their frame, metres."""
-    rows, counts = sampled_rows(source.valid)
-    xp = numpy_for(source, counts)
-    # Squares of huge coordinates overflow.
-    with np.errstate(over="ignore"):
-        return median(xp.where(counts, xp.linalg.norm(xp.asarray(source.points)[rows], axis=1), np.nan))
-
-
 def settings_for(
     options: Options, method: AbstractMethod, source: PointCloud, target: PointCloud, stride: Any, may_move: Any
 ) -> Settings:
@@ -115,12 +106,18 @@ def settings_for(
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance: Any = least if options.translation_tolerance is None else options.translation_tolerance
     steps = [harmful_steps(constant(cloud), spacing) for cloud in (source, target)]
-    near = _NEAR * _median_range(constant(source))
+    fixed = constant(source)
+    rows, counts = sampled_rows(fixed.valid)
+    xp: Any = numpy_for(fixed, counts)
+    # Squares of huge coordinates overflow.
+    with np.errstate(over="ignore"):
+        ranges = xp.where(counts, xp.linalg.norm(xp.asarray(fixed.points)[rows], axis=1), np.nan)
+    near = _NEAR * median(ranges)
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
     limits, turn = (options.min_coarse_distance, options.max_coarse_distance), options.rotation_tolerance
     dtype = source.points.dtype
     others = options.hold_unconstrained, may_move, stride
-    xp: Any = numpy_for(coarse, fine, limits, tolerance, least, turn, others, steps, near)
+    xp = numpy_for(coarse, fine, limits, tolerance, least, turn, others, steps, near)
     # Steps of huge coordinates overflow.
     with np.errstate(over="ignore"):
         # An error that is uniform over a step. It does not average out: points on lattices match the lattice.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, TypeVar, cast
+from typing import Generic, NamedTuple, TypeVar, cast
 
 import jaxlie
 import numpy as np
@@ -212,42 +212,37 @@ def choice_of(candidates: list[Candidate[AnyRun]], doubt: Doubt, fine: float) ->
         """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone decides."""
         return doubt.by_shape and other.moved < best.moved - fine and other.fit.coincides_like(best.fit)
 
-    def replaces(other: Candidate[AnyRun]) -> bool:
-        """Whether a pose has converged, and surfaces coincide about as well as at the best, which is changing."""
-        return bool(other.state.status == Status.CONVERGED and _BETTER * other.fit.fit >= best.fit.fit)
-
     changing = candidates[0] if doubt.changing else None
     if best.state.status == Status.DEGENERATE:
         # Along what nothing constrains, the pose keeps its initial value.
         best = next(filter(is_nearer, candidates), best)
     elif best.state.status == Status.MAX_ITERATIONS:
-        changing, best = best, next(filter(replaces, candidates), best)
+        # A pose that has converged, where surfaces coincide about as well, replaces one that is changing.
+        converged = [other for other in candidates if other.state.status == Status.CONVERGED]
+        alike = [other for other in converged if _BETTER * other.fit.fit >= best.fit.fit]
+        changing, best = best, (alike or [best])[0]
     margin = 1 / _BETTER if doubt.few else 1.0
     rivals = [
         other
         for other in candidates
         if doubt.little or other is changing or other.fit.exceeds(best.fit, margin) or is_nearer(other)
     ]
-    return best.run, _ambiguity(best, rivals, doubt.little, fine)
-
-
-def _ambiguity(best: Candidate[Any], rivals: list[Candidate[Any]], little: bool, fine: float) -> str:
-    """Why the pose of the best candidate is ambiguous, and what to pass; or nothing."""
+    # Why the pose of the best one is ambiguous, and what to pass.
     distances = [distance_moved(best.state.pose, rival.state) for rival in rivals]
     apart = max(distances, default=0.0)
-    common = f"fewer than {_LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if little else ""
-    if little and len(rivals) == 1:
-        return f"{common}registration with a smaller max_distance fails; pass a better initial pose"
+    common = f"fewer than {_LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
+    if doubt.little and len(rivals) == 1:
+        return best.run, f"{common}registration with a smaller max_distance fails; pass a better initial pose"
     if apart <= fine:
-        return ""
+        return best.run, ""
     rival = rivals[distances.index(apart)]
     nearest = min(best, rival, key=lambda candidate: candidate.moved)
-    changing = rival.state.status == Status.MAX_ITERATIONS
-    another = "another that is still changing" if changing else "another"
-    coincide = "" if changing or little else ", where the surfaces coincide about as well"
+    unsettled = rival.state.status == Status.MAX_ITERATIONS
+    another = "another that is still changing" if unsettled else "another"
+    coincide = "" if unsettled or doubt.little else ", where the surfaces coincide about as well"
     # Two distances would lead to the same doubt.
     advice = f"max_distance={nearest.limit} if the initial pose is good to {fine:.2g} m, or else "
-    return (
+    return best.run, (
         f"{common}max_distance={best.limit} leads to this pose, {best.moved:.2g} m from the initial one, but "
         f"max_distance={rival.limit} to {another}, {apart:.2g} m from this one{coincide}. Pass "
         f"{advice if len(nearest.max_distance) == 1 else ''}a better init"

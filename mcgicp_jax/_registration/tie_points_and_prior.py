@@ -36,7 +36,8 @@ from mcgicp_jax._registration.loop import Problem, State
 # inverse of a correlation matrix keeps four digits in float64. Below it, a direction of a prior counts as fixed.
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
 # Rounding of the information of a prior at the least standard deviation σ₀, with lengths in units of the cloud: a
-# standard deviation of 3 %. A variance v becomes v + σ₀² (1 + v/σ₀²)⁻⁸: nearly the larger of the two, at least 0.42 σ₀².
+# standard deviation of 3 %. A variance v becomes v + σ₀² (1 + v/σ₀²)⁻⁸, nearly the larger of the two, and at least
+# 0.42 σ₀².
 _LARGEST_ERROR, _SHARPNESS = 1e3, 8
 # Standard deviations of a prior, of the motion of a point, within which the right pose is expected.
 _DEVIATIONS = 3.0
@@ -52,37 +53,35 @@ else:
 def checked_measurements(
     tie_points: GivenTiePoints | None, prior: GivenPrior | None, source: PointCloud, target: PointCloud
 ) -> tuple[TiePoints | None, Prior | None]:
-    ties = None if tie_points is None else _centred_tie_points(tie_points, source, target)
-    return ties, None if prior is None else _centred_prior(prior, source, target)
-
-
-def _centred_tie_points(tie_points: GivenTiePoints, source: PointCloud, target: PointCloud) -> TiePoints:
-    points, targets, covariances = _parts("tie_points", tie_points, "(source_points, target_points, covariances)", 3)
-    count = np.shape(points)[0] if np.ndim(points) else 0
-    points = _numbers("tie_points: source_points", points, (count, 3))
-    targets = _numbers("tie_points: target_points", targets, (count, 3))
-    covariances = _numbers("tie_points: covariances", covariances, (count, 3, 3))
-    if is_concrete(covariances):
-        _, correlations = _correlations(covariances)
-        definite = bool(np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE)
-        _require("tie_points: covariances", correlations, definite, "positive definite")
-    return TiePoints(points - source.origin, targets - target.origin, covariances)
-
-
-def _centred_prior(prior: GivenPrior, source: PointCloud, target: PointCloud) -> Prior:
+    ties = None
+    if tie_points is not None:
+        form = "(source_points, target_points, covariances)"
+        points, targets, covariances = _parts("tie_points", tie_points, form, 3)
+        count = np.shape(points)[0] if np.ndim(points) else 0
+        points = _numbers("tie_points: source_points", points, (count, 3))
+        targets = _numbers("tie_points: target_points", targets, (count, 3))
+        covariances = _numbers("tie_points: covariances", covariances, (count, 3, 3))
+        if is_concrete(covariances):
+            _, correlations = _correlations(covariances)
+            definite = bool(np.linalg.eigvalsh(correlations).min(initial=1) > _LEAST_EIGENVALUE)
+            _require("tie_points: covariances", correlations, definite, "positive definite")
+        ties = TiePoints(points - source.origin, targets - target.origin, covariances)
+    if prior is None:
+        return ties, None
     pose, covariance = _parts("prior", prior, "(pose, covariance)", 2)
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     # The points only scale the least deviations: while they are differentiated, their values suffice.
     cloud = primal(source)
     if is_concrete(covariance, cloud.points, source.origin):
-        return Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, cloud))
+        return ties, Prior(matrix[:3, :3], matrix[:3, 3], *_information(covariance, cloud))
     fixed, value = None, primal(covariance)
     if is_concrete(value):
         values, rows = _principal_rows(np.asarray(value, np.float64))
         fixed = _orthonormal(rows[values <= _LEAST_EIGENVALUE])
     variances = (_lengths(cloud) * _least_deviation(cloud)) ** 2
-    return Prior(matrix[:3, :3], matrix[:3, 3], *_information_traced(covariance, fixed, source.origin, variances))
+    information = _information_traced(covariance, fixed, source.origin, variances)
+    return ties, Prior(matrix[:3, :3], matrix[:3, 3], *information)
 
 
 def _lengths(source: PointCloud) -> Float[AnyArray, "6"]:
@@ -93,7 +92,7 @@ def _lengths(source: PointCloud) -> Float[AnyArray, "6"]:
 
 
 def _least_deviation(source: PointCloud) -> float:
-    """σ₀ of `_LARGEST_ERROR`, in units of `_lengths`; the rounding of more precise directions would spoil the others."""
+    """σ₀ of `_LARGEST_ERROR`, in units of `_lengths`. Rounding of more precise directions would spoil the others."""
     return float(np.sqrt(np.finfo(source.points.dtype).eps / _LARGEST_ERROR))
 
 
