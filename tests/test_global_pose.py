@@ -1,8 +1,11 @@
 """Poses from any start: features against plain loops, poses against SciPy, honest verdicts, and no compilations."""
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -475,6 +478,30 @@ def test_a_global_pose_that_is_unsure_leaves_the_registration_unverified():
     with pytest.warns(UserWarning, match="global pose: none found, 0 of .* pass a pose as init"):
         lost = mcg.register(*noise, mcg.GICP(), init="global")
     assert lost.status is mcg.Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sure", [True, False])
+def test_a_worker_that_differentiates_knows_how_sure_the_start_is(sure):
+    """A sure start limits the coarse `max_distance`, and of one that is not, a warning tells."""
+    ours = office(1, 4000)
+    source, target = (ours.source, ours.target) if sure else map(mcg.preprocess, strangers(1000))
+
+    def registered(points, executor):
+        options = {"init": "global", "executor": executor}
+        (result,) = mcg.register_batch([source.replace(points=points)], [target], mcg.GICP(), **options)
+        return result
+
+    def poses(executor):
+        doubtful = pytest.warns(mcg.PairWarning, match="^pair 0: global pose: too little evidence")
+        with nullcontext() if sure else doubtful:
+            matrix, back = jax.vjp(lambda points: registered(points, executor).matrix, jnp.asarray(source.points))
+        return matrix, *back(jnp.ones((4, 4)))
+
+    with ThreadPoolExecutor(1) as worker:
+        (matrix, gradient), (by_worker, gradient_by_worker) = poses(None), poses(worker)
+    np.testing.assert_array_equal(by_worker, matrix)
+    np.testing.assert_allclose(gradient_by_worker, gradient, atol=1e-5 * np.abs(gradient).max())
 
 
 @pytest.mark.slow

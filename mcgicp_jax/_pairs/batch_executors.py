@@ -103,12 +103,12 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
                 )
             prepared[pair.index] = ready
             source, target, *_ = ready.inputs.values()
-            yield Pair(pair.index, source, target, ready.init, ready.prior, ready.traced)
+            start = ready.init, ready.prior, ready.traced, ready.doubt, ready.max_coarse_distance
+            yield Pair(pair.index, source, target, *start)
 
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
     for answer in _results(fixed, sent(), executor, None):
-        ready = prepared[answer.index]
-        result = ready.checked(answer.registration)
+        ready, result = prepared[answer.index], answer.registration
         if answer.jacobian:
             values, inputs = [np.asarray(result.centred.wxyz_xyz)], [ready.leaves[i] for i in ready.traced]
             (pose,) = with_derivative(values, KnownJacobian(answer.jacobian), inputs)

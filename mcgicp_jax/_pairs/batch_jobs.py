@@ -80,7 +80,7 @@ class PairWarning(UserWarning):
 @dataclass(frozen=True)
 class Pair:
     """The arguments of one pair. `traced` numbers the leaves of clouds, method and kernel by which the pose is to be
-    differentiated; if there are any, the clouds are preprocessed."""
+    differentiated; if there are any, the other fields are those of a `PreparedPair`."""
 
     index: int
     source: Cloud
@@ -88,6 +88,8 @@ class Pair:
     init: Pose | Literal["global"] | None
     prior: GivenPrior | None = None
     traced: tuple[int, ...] = ()
+    doubt: str = ""
+    max_coarse_distance: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -229,15 +231,16 @@ class BatchJob:
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
         values: Any = (pair.source, pair.target, self.method, self.options.robust)
         inputs = Inputs(*values)._replace(prior=checked_measurements(None, pair.prior, *values[:2])[1])
-        run = self._run(PreparedPair(pair.index, inputs, pair.init))  # type: ignore[arg-type]
+        ready = PreparedPair(pair.index, inputs, cast(Pose, pair.init), None, pair.doubt, pair.max_coarse_distance)
+        run = self._run(ready)
         if isinstance(run, PairResult):
             return run
-        (result,) = map(verified, results_of([run], [run.inputs]))
+        (result,) = map(ready.checked, results_of([run], [run.inputs]))
         leaves = jax.tree.leaves(values, is_leaf=is_deferred)
         arrays = [leaves[i] for i in pair.traced]
         slopes = parameters_by(inputs, run.inputs, cast(HostExecutor, run.executor), run.loop, arrays)
         blocks = tuple(slope.astype(array.dtype) for slope, array in zip(slopes, arrays, strict=True))
-        return replace(self._result(pair.index, result, run.doubt), jacobian=blocks)
+        return replace(self._result(pair.index, result, ready.doubt or run.doubt), jacobian=blocks)
 
     def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
         """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""
