@@ -288,6 +288,7 @@ def test_ford_poses_are_those_of_the_laser(ford_folder):
         (kitti, "calib.txt", b"P2: 1 2 3\n"),
         (kitti, "times.txt", b"0.1\nlater\n"),
         (tum_rgbd, "rgb.txt", b"9.0\n"),
+        (tum_rgbd, "rgb.txt", b"# colour\n"),
         (tum_rgbd, ".", b"9.0 rgb/1.0.png\n"),
         (ford_campus, "SCANS/Scan0075.mat", b"no such thing"),
         (ford_campus, "Timestamp.log", b"nothing\n"),

@@ -209,10 +209,12 @@ def test_maps_show_the_same_part_of_the_world():
     whole = merge_clouds([frame.cloud for frame in frames], [frame.pose for frame in frames], 0.01)
     moved = whole.transform(motion((0.3, 0, 0, 0, 0, 0)))
     bare = PointCloud(whole.points)
-    figure = plot.maps({"one": whole, "moved": moved, "bare": bare})
-    one, other, grey = (panel.images[0].get_array() for panel in figure.axes)
+    nothing = PointCloud(np.full((5, 3), np.nan))
+    figure = plot.maps({"one": whole, "moved": moved, "bare": bare, "nothing": nothing})
+    one, other, grey, white = (panel.images[0].get_array() for panel in figure.axes)
+    assert np.all(white == 1)
     assert one.shape == other.shape == grey.shape
-    assert [panel.get_title() for panel in figure.axes] == ["one", "moved", "bare"]
+    assert [panel.get_title() for panel in figure.axes] == ["one", "moved", "bare", "nothing"]
     assert {label for panel in figure.axes for label in (panel.get_xlabel(), panel.get_ylabel())} == {"metres"}
     # Where the moved map has left, the paper is white; without channels it is grey.
     assert np.mean(np.all(other == 1, axis=-1)) > np.mean(np.all(one == 1, axis=-1)) + 0.1

@@ -25,7 +25,7 @@ from tests.graphs import (
     with_gtsam,
     with_priors,
 )
-from tests.reference import logarithm
+from tests.reference import exponential, logarithm
 from tests.refusals import refused
 from tests.scenes import motion
 
@@ -359,6 +359,15 @@ def test_chi_squared_tells_whether_the_information_is_right():
     precise = mcg.Edge(edges.i, edges.j, edges.T_i_j, 100 * edges.information)
     assert mcg.optimize_poses(mcg.PoseGraph(graph.poses, precise), robust=False).chi_squared > 50
     assert np.isnan(mcg.optimize_poses(mcg.PoseGraph(graph.poses, edges[: len(graph.poses) - 1])).chi_squared)
+    # Measurements in the world's frame count the same, be they edges or factors, and let the first pose move.
+    prior = mcg.Edge(mcg.WORLD, 0, graph.poses[0] @ exponential(np.full(6, 0.1)), information=np.eye(6))
+    two = [prior, mcg.Edge(mcg.WORLD, 1, graph.poses[1], information=np.eye(6))]
+    joined = jax.tree.map(lambda *values: np.concatenate([values[0], np.stack(values[1:])]), edges, *two)
+    expected = mcg.optimize_poses(mcg.PoseGraph(graph.poses, joined), robust=False)
+    assert expected.num_redundant == 6 * (len(joined) - len(graph.poses)) and expected.factor_residuals == ()
+    stacked = jax.tree.map(lambda *values: np.stack(values), *two)
+    with_factor = mcg.optimize_poses(mcg.PoseGraph(graph.poses, edges, [stacked]), robust=False)
+    np.testing.assert_allclose(with_factor.chi_squared, expected.chi_squared, rtol=1e-9)
 
 
 def test_an_exact_graph_ends_at_the_truth():

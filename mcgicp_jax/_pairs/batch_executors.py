@@ -208,17 +208,19 @@ class _Start:
             if self._first is None and self._pays(pair):
                 text = "register_batch: %d processes start, and take over from threads once they run"
                 LOGGER.info(text, self._num_workers)
-                processes = Processes(self._num_workers)
+                self.processes = Processes(self._num_workers)
                 receive = with_settings(_as_numpy(self._job).received, pickled=True)
-                self._first = processes.submit(receive, _as_numpy(pair))
-                self.processes = processes
+                self._first = self.processes.submit(receive, _as_numpy(pair))
             if self._first is None or not self._first.done():
                 return False
             self._first.result()
         # Not what can be pickled, or imported by a worker; or this platform starts none.
         except Exception as error:
             LOGGER.info("register_batch: pairs stay in threads; %s", _words(error))
-            self._possible, self.processes = False, None
+            self._possible = False
+            if self.processes is not None:
+                self.processes.shutdown(cancel_futures=True)
+                self.processes = None
         return self._possible
 
     def _pays(self, pair: Pair) -> bool:

@@ -36,6 +36,7 @@ class PoseGraphResult:
         residuals: (m,) √(rᵀΛr), the Mahalanobis distance of each edge, in standard deviations.
         weights: (m,) 1 for edges that were kept and 0 for those that were rejected.
         factor_residuals, factor_weights: the same for each element of `PoseGraph.factors`.
+        num_redundant: size of all kept residuals, less six per pose that may move.
         uncertainty: deferred value of `covariance`.
     """
 
@@ -48,6 +49,7 @@ class PoseGraphResult:
     weights: Float[Array, "m"] | Float[np.ndarray, "m"]
     factor_residuals: tuple[AnyArray, ...]
     factor_weights: tuple[AnyArray, ...]
+    num_redundant: Float[ArrayLike, ""]
     uncertainty: Lazy[Any]
 
     @property
@@ -57,17 +59,15 @@ class PoseGraphResult:
 
     @property
     def chi_squared(self) -> Any:
-        """χ² of the kept edges per degree of freedom: about 1 for independent errors and right information matrices.
+        """χ² of the kept measurements per redundant number: about 1 for independent errors and right information
+        matrices; NaN if no number is redundant.
 
-        There are six degrees of freedom per edge, less six per pose that may move; NaN if none is left. Registrations
-        of the same clouds share their noise, which partly cancels around loops: graphs of `odometry` and `multiway`
-        have 0.2 to 0.5.
+        Registrations of the same clouds share their noise, which partly cancels around loops: graphs of `odometry` and
+        `multiway` have 0.2 to 0.5.
         """
-        xp = numpy_for(self.weights, self.residuals)
-        of_world = xp.any(xp.asarray(self.edges.i) == WORLD)
-        redundant = 6.0 * (xp.sum(self.weights) - (len(self.poses) - 1 + of_world))
-        total = xp.sum(self.weights * self.residuals**2)
-        return xp.where(redundant > 0, total / xp.where(redundant > 0, redundant, 1), xp.nan)[()]
+        xp = numpy_for(self.cost, self.num_redundant)
+        some = self.num_redundant > 0
+        return xp.where(some, 2 * self.cost / xp.where(some, self.num_redundant, 1), xp.nan)[()]
 
     @property
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:
@@ -153,6 +153,8 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
     xp = numpy_for(solution)
     residuals, *factor_residuals = xp.split(solution.residuals, ends)
     weights, *factor_weights = xp.split(solution.weights, ends)
+    sizes = np.concatenate([np.full(len(factor.information), factor.information.shape[-1]) for factor in factors])
+    num_free = len(graph.poses) - 1 + xp.any(xp.concatenate([xp.ravel(factor.rows) for factor in factors]) == WORLD)
     return PoseGraphResult(
         poses=solution.poses,
         edges=graph.edges,
@@ -163,5 +165,6 @@ def optimize_poses(graph: PoseGraph, *, robust: bool = True, max_iterations: int
         weights=weights,
         factor_residuals=tuple(factor_residuals),
         factor_weights=tuple(factor_weights),
+        num_redundant=xp.sum(solution.weights * sizes) - 6 * num_free,
         uncertainty=covariances,
     )

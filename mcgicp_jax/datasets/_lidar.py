@@ -145,13 +145,13 @@ class FordFrames(AbstractFrames):
             time = float(scan["timestamp_laser"])
             cameras = [scan["Cam"]] if isinstance(scan["Cam"], dict) else list(scan["Cam"])
             colors, colored = self._paint(len(points), cameras, float(scan["timestamp_camera"]))
+            intensity = None
+            if "reflectivity" in scan:
+                intensity = np.asarray(scan["reflectivity"], np.float32).reshape(len(points), 1)
         except OSError:
             raise
         except Exception as error:  # SciPy raises arbitrary exceptions for malformed files.
             raise ValueError(f"{path}: cannot be read as a scan of Ford Campus: {error!r}") from error
-        intensity = None
-        if "reflectivity" in scan:
-            intensity = np.asarray(scan["reflectivity"], float).reshape(-1, 1).astype(np.float32)
         cloud = colored_cloud(points.astype(np.float32), colors, colored, intensity)
         # The vehicle's pose is x, y, z in metres and roll, pitch, yaw in radians: Rz(yaw) Ry(pitch) Rx(roll).
         pose = pose_of(Rotation.from_euler("xyz", vehicle[3:]), vehicle[:3]) @ _LASER_IN_VEHICLE

@@ -103,6 +103,8 @@ class TUMFrames(AbstractFrames):
 def _read_list(path: Path) -> tuple[Float[np.ndarray, "N"], Shaped[np.ndarray, "N"]]:
     """Time stamps in seconds, and file names."""
     rows = [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    if not rows:
+        raise ValueError(f"{path}: expected lines of a time stamp and a file name, found none")
     try:
         return np.array([float(time) for time, _ in rows]), np.array([name for _, name in rows])
     except ValueError as error:

@@ -257,7 +257,7 @@ def _shaded(cloud: PointCloud, view: View) -> Picture:
             values = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
         else:
             values = view.project(points)[1]
-        low, high = np.nanpercentile(values, [2, 98])
+        low, high = np.nanpercentile(values, [2, 98]) if np.isfinite(values).any() else (0.0, 1.0)
         grey = np.clip((values - low) / max(high - low, np.finfo(float).tiny), 0, 1)
         colors = np.repeat(0.85 * np.nan_to_num(grey, nan=0.5)[:, None], 3, axis=1)
     return np.nan_to_num(drawing.paint(view, points, np.nan_to_num(colors, nan=0.5)), nan=1)
