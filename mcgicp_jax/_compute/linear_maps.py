@@ -98,6 +98,7 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
     def attached(*inputs: Any) -> list[jax.Array]:
         return [jnp.asarray(value) for value in values]
 
+    @partial(attached.defjvp, symbolic_zeros=True)
     @with_settings_of_package
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
         # An outer differentiation, even by other inputs, would see constants.
@@ -119,7 +120,6 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
         )
         return outputs, slopes
 
-    attached.defjvp(rule, symbolic_zeros=True)
     return attached(*inputs)
 
 
@@ -179,13 +179,12 @@ def once(value: Any) -> Any:
     return value
 
 
+@partial(once.defjvp, symbolic_zeros=True)
 def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     if not is_symbolic_zero(tangents[0]):
         raise NotImplementedError("poses have first derivatives only; costs have second ones inside jit alone")
     return primals[0], jnp.zeros_like(primals[0])
 
-
-once.defjvp(_once_jvp, symbolic_zeros=True)
 
 # Applies `function`, a linear map of NumPy arrays with one leading axis; `transpose` is its transpose. The shapes of
 # `inputs` and `outputs` are without the axes `batch`, which `vmap` adds in front.
@@ -250,13 +249,13 @@ def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
     def constant_by(value: Any, *inputs: Any) -> Any:
         return value
 
+    @partial(constant_by.defjvp, symbolic_zeros=True)
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         value = primals[0]
         moving = [tangent for tangent in tangents if not is_symbolic_zero(tangent)]
         tangent = _unknown.bind(*moving, aval=jax.typeof(value), message=message) if moving else jnp.zeros_like(value)
         return value, tangent
 
-    constant_by.defjvp(rule, symbolic_zeros=True)
     return jax.tree.map(lambda leaf: constant_by(jnp.asarray(leaf), *tracers) if _is_float(leaf) else leaf, tree)
 
 

@@ -102,7 +102,10 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
     # On a single core, other threads would only take turns with this one.
     if max_threads != 1 and num_cores() > 1:
         elsewhere = functools.partial(_run_with, _settings(), work)
-        helpers = [_submit(elsewhere) for _ in range(min(len(calls), max_threads or len(calls)) - 1)]
+        # No thread may be available, e.g. at interpreter shutdown.
+        with contextlib.suppress(RuntimeError):
+            for _ in range(min(len(calls), max_threads or len(calls)) - 1):
+                helpers.append(_threads().submit(elsewhere))
     try:
         answers[first] = call()
         work()
@@ -181,14 +184,6 @@ def _run_with(values: list[Any], work: Callable[..., Answer], *arguments: Any) -
             for setting, value in zip(_SETTINGS, values, strict=True):
                 stack.enter_context(setting(value))
         return work(*arguments)
-
-
-def _submit(work: Callable[[], None]) -> Future[None]:
-    try:
-        return _threads().submit(work)
-    except RuntimeError:
-        # No thread is available, e.g. at interpreter shutdown: a future that never starts can be cancelled.
-        return Future()
 
 
 @functools.cache
