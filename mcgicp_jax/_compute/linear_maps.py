@@ -208,9 +208,7 @@ def _shapes(*_: Any, outputs: Any, batch: Any, **__: Any) -> Any:
     return [aval.update(shape=(*batch, *aval.shape)) for aval in outputs]
 
 
-def _transposed(
-    cotangents: Any, *_: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any
-) -> Any:
+def _transposed(cotangents: Any, *_: Any, function: Any, transpose: Any, inputs: Any, outputs: Any, batch: Any) -> Any:
     swapped = {"function": transpose, "transpose": function, "inputs": outputs, "outputs": inputs}
     return _linear.bind(*map(ad.instantiate_zeros, cotangents), **swapped, batch=batch)
 
@@ -225,16 +223,15 @@ def _batched(operands: Any, axes: Any, *, batch: Any, **parameters: Any) -> Any:
     return results, [0] * len(results)
 
 
-def _not_compiled(*_: Any, **__: Any) -> Any:
-    # A callback would run compiled programs, which was seen to deadlock.
-    raise NotImplementedError(
-        "the derivative of a registration outside of jit was to be compiled; put the registration inside the jit, too"
-    )
+def _refused(*_: Any, message: str, **__: Any) -> Any:
+    raise NotImplementedError(message)
 
 
 ad.deflinear2(_linear, _transposed)
 batching.primitive_batchers[_linear] = _batched
-mlir.register_lowering(_linear, _not_compiled)
+# A callback would run compiled programs, which was seen to deadlock.
+_ADVICE = "the derivative of a registration outside of jit was to be compiled; put the registration inside the jit, too"
+mlir.register_lowering(_linear, partial(_refused, message=_ADVICE))
 
 
 def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
@@ -273,10 +270,6 @@ def _nan(*_: Any, aval: Any, message: str) -> Any:
 
 
 _unknown.def_abstract_eval(lambda *_, aval, message: aval)
-
-
-def _refused(*_: Any, message: str, **__: Any) -> Any:
-    raise NotImplementedError(message)
 
 
 def _unknown_batched(operands: Any, axes: Any, *, aval: Any, message: str) -> Any:
