@@ -31,11 +31,9 @@ else:
 class DeferredRows:
     """A concrete array, such as the neighbours of points, whose rows are computed when they are needed.
 
-    As a pytree it is the whole array: flattening it computes all rows, as do transformations and copies.
-
-    Args:
-        compute: as of `RowsOnDemand`.
-        anew: makes the same object for pickles, so that a worker computes it; None: pickles hold the whole array.
+    As a pytree it is the whole array: flattening it computes all rows, as do transformations and copies. `compute` is
+    as of `RowsOnDemand`. `anew` makes the same object for pickles, so that a worker computes it; with None, pickles
+    hold the whole array.
     """
 
     def __init__(

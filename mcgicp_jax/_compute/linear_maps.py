@@ -124,13 +124,8 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
 
 
 class RowAverage(AbstractLinearMap):
-    """Each row of the result is the mean of some rows.
-
-    Args:
-        rows, groups: which row counts in which row of the result.
-        counted: (n, C) or (n, 1), which of its entries count.
-        sizes: numbers of rows of the array and of the result.
-    """
+    """Each row of the result is the mean of some rows: `rows[i]` of the array counts in row `groups[i]` of the result,
+    with those of its entries that are `counted`, (n, C) or (n, 1). `sizes`: numbers of rows of array and result."""
 
     def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], counted: Any, sizes: tuple[int, int]):
         ones = np.ones(len(rows))

@@ -247,12 +247,9 @@ def _slopes_of_products(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, 
 
 
 class SurfaceNoise(NamedTuple):
-    """Values that only the status and the covariance of the final pose need, most of them as in `LocalGeometry`.
-
-    Attributes:
-        descriptors: variance of the descriptors α · channel about their linear fits, metres², summed over the channels.
-        slopes: gradients of the descriptors; None where channels are not used, and for cells.
-    """
+    """Values that only the status and the covariance of the final pose need, most of them as in `LocalGeometry`; of the
+    descriptors α · channel, the variance about their linear fits, metres², summed over the channels, and the gradients,
+    None where channels are not used, and for cells."""
 
     descriptors: Float[AnyArray, "*batch N"]
     normal: Float[AnyArray, "*batch N 3"]

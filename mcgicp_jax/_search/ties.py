@@ -95,13 +95,11 @@ class TiedTree:
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest points of each query (all points if there are fewer), ordered by distance and then row.
+        """Rows of the k nearest points of each query (all points if there are fewer), ordered by distance and then row;
+        M for none within `bound`. And the slack: half the gap between the k-th nearest and the next, which is taken to
+        lie at the bound if none is within it; 0 without a k-th nearest.
 
         Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
-
-        Returns:
-            Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the k-th nearest
-            and the next, which is taken to lie at the bound if none is within it; 0 without a k-th nearest.
         """
         if self._rows is not None and k >= self._most_equal:
             return TiedTree(self._trees, self.points, k + 1).nearest(queries, k, bound)
