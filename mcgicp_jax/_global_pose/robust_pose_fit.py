@@ -117,9 +117,8 @@ def hypotheses(
         normal = unit(jnp.cross(along, r - p))
         frames.append(jnp.stack([along, jnp.cross(normal, along), normal], axis=-1))
         centroids.append((p + q + r) / 3)
-    a, b = centroids
     rotation = jnp.sum(frames[1][:, :, None, :] * frames[0][:, None, :, :], axis=-1)
-    translation = b - jnp.sum(rotation * a[:, None, :], axis=-1)
+    translation = centroids[1] - jnp.sum(rotation * centroids[0][:, None, :], axis=-1)
     agree = (support[first, second] > 0) & (support[first, third] > 0) & (support[second, third] > 0)
     edges = [matches.source[rows] - matches.source[first] for rows in (second, third)]
     area = jnp.sqrt(jnp.sum(jnp.cross(edges[0], edges[1]) ** 2, axis=-1))

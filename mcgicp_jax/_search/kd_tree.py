@@ -104,8 +104,8 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
             index = _indices.get(digest.digest(), partial(self.index, target))
             return index.nearest(pose, source, float(max_distance), num_candidates)
 
-        arguments = pose, source, target, max_distance, running
-        return call_host(nearest, jax.ShapeDtypeStruct(shape, jnp.int32), *arguments)
+        result = jax.ShapeDtypeStruct(shape, jnp.int32)
+        return call_host(nearest, result, pose, source, target, max_distance, running)
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
         return self.neighbors_on_demand(points, num_neighbors).whole
