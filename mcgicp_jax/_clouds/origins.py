@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion, turn_by_quaternion
 
 
+@with_settings_of_package
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
     """T(−o_t) · T · T(o_s), (4, 4): the pose between centred coordinates, in its own precision; `name`: for errors."""
     distance = 0.0
@@ -30,18 +30,12 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
     matrix = pose_matrix(pose, name, distance)
     if is_concrete(source.origin, target.origin) and not (np.any(source.origin) or np.any(target.origin)):
         return matrix
-    return _between_origins(matrix, source.origin, target.origin)
-
-
-@with_settings_of_package
-def _between_origins(matrix: Any, source_origin: Any, target_origin: Any) -> Array | np.ndarray:
-    rotation, translation = matrix[:3, :3], matrix[:3, 3]
     # In this form two far origins cancel exactly before either is rotated.
-    shifted = (rotation - np.eye(3)) @ source_origin + (source_origin - target_origin) + translation
+    shifted = (matrix[:3, :3] - np.eye(3)) @ source.origin + (source.origin - target.origin) + matrix[:3, 3]
     if isinstance(shifted, np.ndarray) and isinstance(matrix, np.ndarray):
-        result = matrix.copy()
-        result[:3, 3] = shifted
-        return result
+        matrix = matrix.copy()
+        matrix[:3, 3] = shifted
+        return matrix
     return jnp.asarray(matrix).at[:3, 3].set(shifted)
 
 

@@ -94,18 +94,6 @@ def _checked_mask(channels: Any, channel_valid: Values | None, shape: tuple[int,
     return measured if valid is None else measured & valid
 
 
-def _fractions(times: Values, size: int) -> Any:
-    """`times` scaled so that the earliest is 0 and the latest 1; if all are equal, all are 1."""
-    values = _as_float("times", times)
-    if values.shape != (size,):
-        raise ValueError(f"times: expected shape ({size},) to go with points, got {values.shape}")
-    if is_concrete(values) and not np.isfinite(values).all():
-        raise ValueError("times: expected finite numbers, got NaN or infinity")
-    xp = np if isinstance(values, np.ndarray) else jnp
-    first, last = xp.min(values, initial=np.inf), xp.max(values, initial=-np.inf)
-    return xp.where(last > first, (values - first) / xp.where(last > first, last - first, 1), 1)
-
-
 def _blank(channels: Any, channel_valid: Any) -> Any:
     """Set missing channel values, often NaN, to 0, so that they never enter arithmetic."""
     xp = np if isinstance(channels, np.ndarray) and isinstance(channel_valid, np.ndarray) else jnp
@@ -243,7 +231,17 @@ class PointCloud(eqx.Module):
         if self.covariances is not None and self.covariances.shape != (size, 3, 3):
             raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
         self.channel_names = _checked_names(channel_names, self.channels.shape[1])
-        self.times = None if times is None else _fractions(times, size)
+        self.times = None
+        if times is not None:
+            values = _as_float("times", times)
+            if values.shape != (size,):
+                raise ValueError(f"times: expected shape ({size},) to go with points, got {values.shape}")
+            if is_concrete(values) and not np.isfinite(values).all():
+                raise ValueError("times: expected finite numbers, got NaN or infinity")
+            # Scaled so that the earliest is 0 and the latest 1; if all are equal, all are 1.
+            xp = np if isinstance(values, np.ndarray) else jnp
+            first, last = xp.min(values, initial=np.inf), xp.max(values, initial=-np.inf)
+            self.times = xp.where(last > first, (values - first) / xp.where(last > first, last - first, 1), 1)
         self.valid = np.ones(size, bool)
         self.deferred_neighbors = None
         self.origin = np.zeros(3)

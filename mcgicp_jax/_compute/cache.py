@@ -82,19 +82,15 @@ def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Paramete
             return compute(*arguments, **named)
         cloud, *rest = arguments
         leaves, structure = jax.tree.flatten((rest, named))
-        key = (structure, *map(_by_value, leaves))
+        for i, leaf in enumerate(leaves):
+            if isinstance(leaf, np.ndarray | np.generic | jax.Array | bool | int | float):
+                array = np.asarray(leaf)
+                leaves[i] = array.dtype.str, array.shape, array.tobytes()
         caches = _clouds.get(id(cloud), partial(_CachedWithCloud, cloud)).values
         cache = caches.get(compute) or caches.setdefault(compute, Cache(_VALUES_PER_FUNCTION))
-        return cache.get(key, partial(compute, *arguments, **named))
+        return cache.get((structure, *leaves), partial(compute, *arguments, **named))
 
     return cached
-
-
-def _by_value(leaf: Any) -> Hashable:
-    if not isinstance(leaf, np.ndarray | np.generic | jax.Array | bool | int | float):
-        return leaf
-    array = np.asarray(leaf)
-    return array.dtype.str, array.shape, array.tobytes()
 
 
 @jax.tree_util.register_pytree_node_class

@@ -31,11 +31,9 @@ else:
 class DeferredRows:
     """A concrete array, such as the neighbours of points, whose rows are computed when they are needed.
 
-    As a pytree it is the whole array: flattening it computes all rows, as do transformations and copies.
-
-    Args:
-        compute: as of `RowsOnDemand`.
-        anew: makes the same object for pickles, so that a worker computes it; None: pickles hold the whole array.
+    As a pytree it is the whole array: flattening it computes all rows, as do transformations and copies. `compute` is
+    as of `RowsOnDemand`. `anew` makes the same object for pickles, so that a worker computes it; with None, pickles
+    hold the whole array.
     """
 
     def __init__(
@@ -75,6 +73,8 @@ def is_concrete(*trees: object) -> bool:
     return not any(map(is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
 
 
+# Traced inside a trace. The call of a program takes a quarter of the time of an operation.
+_zero = jax.jit(lambda: jnp.zeros(()))
 # The state of JAX's transformations inside the context below; None outside of it.
 _outside: ContextVar[Any] = ContextVar("outside", default=None)
 
@@ -93,12 +93,6 @@ def outside_trace() -> Iterator[None]:
             yield
         finally:
             _outside.reset(before)
-
-
-@jax.jit
-def _zero() -> Array:
-    """Traced inside a trace. The call of a program takes a quarter of the time of an operation."""
-    return jnp.zeros(())
 
 
 def canonical_float() -> Any:

@@ -98,6 +98,7 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
     def attached(*inputs: Any) -> list[jax.Array]:
         return [jnp.asarray(value) for value in values]
 
+    @partial(attached.defjvp, symbolic_zeros=True)
     @with_settings_of_package
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
         # An outer differentiation, even by other inputs, would see constants.
@@ -119,18 +120,12 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
         )
         return outputs, slopes
 
-    attached.defjvp(rule, symbolic_zeros=True)
     return attached(*inputs)
 
 
 class RowAverage(AbstractLinearMap):
-    """Each row of the result is the mean of some rows.
-
-    Args:
-        rows, groups: which row counts in which row of the result.
-        counted: (n, C) or (n, 1), which of its entries count.
-        sizes: numbers of rows of the array and of the result.
-    """
+    """Each row of the result is the mean of some rows: `rows[i]` of the array counts in row `groups[i]` of the result,
+    with those of its entries that are `counted`, (n, C) or (n, 1). `sizes`: numbers of rows of array and result."""
 
     def __init__(self, rows: Int[np.ndarray, "n"], groups: Int[np.ndarray, "n"], counted: Any, sizes: tuple[int, int]):
         ones = np.ones(len(rows))
@@ -179,13 +174,12 @@ def once(value: Any) -> Any:
     return value
 
 
+@partial(once.defjvp, symbolic_zeros=True)
 def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     if not is_symbolic_zero(tangents[0]):
         raise NotImplementedError("poses have first derivatives only; costs have second ones inside jit alone")
     return primals[0], jnp.zeros_like(primals[0])
 
-
-once.defjvp(_once_jvp, symbolic_zeros=True)
 
 # Applies `function`, a linear map of NumPy arrays with one leading axis; `transpose` is its transpose. The shapes of
 # `inputs` and `outputs` are without the axes `batch`, which `vmap` adds in front.
@@ -209,9 +203,7 @@ def _shapes(*_: Any, outputs: Any, batch: Any, **__: Any) -> Any:
     return [aval.update(shape=(*batch, *aval.shape)) for aval in outputs]
 
 
-def _transposed(
-    cotangents: Any, *_: Any, function: Callable, transpose: Callable, inputs: Any, outputs: Any, batch: Any
-) -> Any:
+def _transposed(cotangents: Any, *_: Any, function: Any, transpose: Any, inputs: Any, outputs: Any, batch: Any) -> Any:
     swapped = {"function": transpose, "transpose": function, "inputs": outputs, "outputs": inputs}
     return _linear.bind(*map(ad.instantiate_zeros, cotangents), **swapped, batch=batch)
 
@@ -226,16 +218,15 @@ def _batched(operands: Any, axes: Any, *, batch: Any, **parameters: Any) -> Any:
     return results, [0] * len(results)
 
 
-def _not_compiled(*_: Any, **__: Any) -> Any:
-    # A callback would run compiled programs, which was seen to deadlock.
-    raise NotImplementedError(
-        "the derivative of a registration outside of jit was to be compiled; put the registration inside the jit, too"
-    )
+def _refused(*_: Any, message: str, **__: Any) -> Any:
+    raise NotImplementedError(message)
 
 
 ad.deflinear2(_linear, _transposed)
 batching.primitive_batchers[_linear] = _batched
-mlir.register_lowering(_linear, _not_compiled)
+# A callback would run compiled programs, which was seen to deadlock.
+_ADVICE = "the derivative of a registration outside of jit was to be compiled; put the registration inside the jit, too"
+mlir.register_lowering(_linear, partial(_refused, message=_ADVICE))
 
 
 def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
@@ -250,13 +241,13 @@ def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
     def constant_by(value: Any, *inputs: Any) -> Any:
         return value
 
+    @partial(constant_by.defjvp, symbolic_zeros=True)
     def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
         value = primals[0]
         moving = [tangent for tangent in tangents if not is_symbolic_zero(tangent)]
         tangent = _unknown.bind(*moving, aval=jax.typeof(value), message=message) if moving else jnp.zeros_like(value)
         return value, tangent
 
-    constant_by.defjvp(rule, symbolic_zeros=True)
     return jax.tree.map(lambda leaf: constant_by(jnp.asarray(leaf), *tracers) if _is_float(leaf) else leaf, tree)
 
 
@@ -274,10 +265,6 @@ def _nan(*_: Any, aval: Any, message: str) -> Any:
 
 
 _unknown.def_abstract_eval(lambda *_, aval, message: aval)
-
-
-def _refused(*_: Any, message: str, **__: Any) -> Any:
-    raise NotImplementedError(message)
 
 
 def _unknown_batched(operands: Any, axes: Any, *, aval: Any, message: str) -> Any:

@@ -87,7 +87,10 @@ def call_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any
     once. The function must not call JAX, which was seen to deadlock as well.
     """
     leaves, structure = jax.tree.flatten(arguments)
-    pieces = [_pieces(leaf) for leaf in leaves]
+    pieces = []
+    for array in map(jnp.asarray, leaves):
+        count = -(-array.nbytes // _LARGEST_PIECE)
+        pieces.append([array] if count <= 1 else jnp.array_split(array, count))
 
     def joined(*split: list[Any]) -> Any:
         arrays = [list(map(np.asarray, parts)) for parts in split]
@@ -95,9 +98,3 @@ def call_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any
         return function(*jax.tree.unflatten(structure, whole))
 
     return jax.pure_callback(joined, shapes, *pieces, vmap_method="sequential")
-
-
-def _pieces(array: Any) -> list[Any]:
-    array = jnp.asarray(array)
-    count = -(-array.nbytes // _LARGEST_PIECE)
-    return [array] if count <= 1 else jnp.array_split(array, count)

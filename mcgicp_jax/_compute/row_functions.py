@@ -176,12 +176,8 @@ class RowFunction:
         return [into.get(id(leaf), np.zeros((count, *np.shape(leaf)))) for leaf in leaves]
 
     def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> None:
-        """Add the cotangents of what is moving to `into`.
-
-        Args:
-            cotangents: (c, L) of the sum, packed, or (N, c, L) of the rows.
-            rows: those whose cotangents are not 0; None for all.
-        """
+        """Add the cotangents of what is moving to `into`, from those of the sum, (c, L), packed, or of the rows,
+        (N, c, L). `rows`: those whose cotangents are not 0; None for all."""
         numbers, *columns = chosen = self._chosen(moving)
         if not any(chosen):
             return
@@ -473,10 +469,8 @@ def _add_rows(
     values: Float[np.ndarray, "*k n c W"],
     scratch: Int[np.ndarray, "N"],
 ) -> None:
-    """Add values to rows that may repeat; negative ones are left out. `np.add.at` takes ten times as long.
-
-    `scratch` is (N,), of any values.
-    """
+    """Add values to rows that may repeat; negative ones are left out. `scratch` has any values. `np.add.at` takes ten
+    times as long."""
     rows, values = rows.reshape(-1), values.reshape(rows.size, -1)
     weights, rows, numbers = (rows >= 0).astype(values.dtype), np.maximum(rows, 0), np.arange(rows.size + 1)
     # Distinct rows: each has the number of its last entry. Sorting would take three times as long as the sum.

@@ -18,26 +18,18 @@ Tree = TypeVar("Tree")
 
 
 class Layout(NamedTuple):
-    """How a tree of arrays lies in one.
-
-    Attributes:
-        shapes: of each array, without the axes that they share.
-        dtypes: of each array; None if it is that of the table.
-    """
+    """How a tree of arrays lies in one."""
 
     structure: Any
-    shapes: tuple[tuple[int, ...], ...]
-    dtypes: tuple[Any, ...]
+    shapes: tuple[tuple[int, ...], ...]  # without the axes that they share
+    dtypes: tuple[Any, ...]  # None where it is that of the table
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=("table",), meta_fields=("layout",))
 @dataclass(frozen=True)
 class Packed(Generic[Tree]):
-    """A tree of arrays in one; a pytree, whose layout is static.
-
-    Attributes:
-        table: (..., L), of the dtype of the floats, if there are any; integers up to 2²⁴ and booleans are exact in it.
-    """
+    """A tree of arrays in one, `table`, (..., L); a pytree, whose layout is static. The dtype is that of the floats, if
+    there are any; integers up to 2²⁴ and booleans are exact in it."""
 
     table: Any
     layout: Layout
@@ -76,10 +68,8 @@ class Packed(Generic[Tree]):
 class RowsOnDemand(Generic[Tree]):
     """A pytree of arrays, each row of which is computed once, when it is first needed. Threads may share it.
 
-    Args:
-        compute: maps row numbers, or None for all rows, and the largest number of threads to a pytree of NumPy arrays.
-            A row must not depend on the others that are computed with it.
-        num_rows: number of rows, at least 1.
+    `compute` maps row numbers, or None for all rows, and the largest number of threads to a pytree of NumPy arrays. A
+    row must not depend on the others that are computed with it; there is at least one.
     """
 
     def __init__(self, compute: Callable[[Any, int | None], Tree], num_rows: int):

@@ -102,7 +102,10 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
     # On a single core, other threads would only take turns with this one.
     if max_threads != 1 and num_cores() > 1:
         elsewhere = functools.partial(_run_with, _settings(), work)
-        helpers = [_submit(elsewhere) for _ in range(min(len(calls), max_threads or len(calls)) - 1)]
+        # No thread may be available, e.g. at interpreter shutdown.
+        with contextlib.suppress(RuntimeError):
+            for _ in range(min(len(calls), max_threads or len(calls)) - 1):
+                helpers.append(_threads().submit(elsewhere))
     try:
         answers[first] = call()
         work()
@@ -117,10 +120,8 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
 
 
 def in_new_thread(call: Callable[[], Answer]) -> Answer:
-    """The result of a call in a thread of its own, where no transformation of this one is active.
-
-    While one is, as inside `jax.grad`, each call of a compiled program takes half a millisecond longer.
-    """
+    """The result of a call in a thread of its own, where no transformation of this one is active: inside `jax.grad`,
+    each call of a compiled program takes half a millisecond longer."""
     return started(call).result()
 
 
@@ -157,11 +158,8 @@ class ReadAhead(Iterator[Answer]):
 
 
 def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Callable[..., Answer]:
-    """The function with this thread's JAX settings and line of warnings, for calls in another thread.
-
-    `pickled` functions go to another process, to which neither devices nor the line can be sent: there, the first
-    device of the same platform is used.
-    """
+    """The function with this thread's JAX settings and line of warnings, for calls in another thread, or `pickled`, in
+    another process, to which neither devices nor the line can be sent: it uses its first device of the platform."""
     if not pickled:
         return functools.partial(_run_with, _settings(), shown_at(calling_line())(work))
     values = [value.platform if isinstance(value, jax.Device) else value for value in _settings()]
@@ -181,14 +179,6 @@ def _run_with(values: list[Any], work: Callable[..., Answer], *arguments: Any) -
             for setting, value in zip(_SETTINGS, values, strict=True):
                 stack.enter_context(setting(value))
         return work(*arguments)
-
-
-def _submit(work: Callable[[], None]) -> Future[None]:
-    try:
-        return _threads().submit(work)
-    except RuntimeError:
-        # No thread is available, e.g. at interpreter shutdown: a future that never starts can be cancelled.
-        return Future()
 
 
 @functools.cache

@@ -8,7 +8,6 @@ point's normal, and histograms are averaged over both signs of the point's norma
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import jax
@@ -70,30 +69,6 @@ def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 
     return blockwise(_statistics, np.float32(voxel_size), *with_near(cloud, True))[0]
 
 
-def comparable(
-    histograms: Sequence[Float[np.ndarray, "_ 33"]], statistics: Sequence[Float[np.ndarray, "_ D"]] | None
-) -> tuple[Float[np.ndarray, "N L"], Float[np.ndarray, "M L"]]:
-    """Features of both clouds on one scale, as integers in float32, whose distances are exact. Statistics of channels
-    are divided by their standard deviations in both clouds; missing ones are set to the mean."""
-    all_histograms = np.concatenate(histograms).astype(np.float64)
-    scale = _DEVIATION / max(float(all_histograms.std()), float(np.finfo(np.float32).tiny))
-    center = all_histograms.mean(axis=0)
-    parts = [[scale * (histogram - center)] for histogram in histograms]
-    if statistics is not None:
-        all_statistics = np.concatenate(statistics).astype(np.float64)
-        finite = np.isfinite(all_statistics)
-        count = np.maximum(finite.sum(axis=0), 1)
-        mean = np.where(finite, all_statistics, 0).sum(axis=0) / count
-        spread = np.sqrt(np.where(finite, (all_statistics - mean) ** 2, 0).sum(axis=0) / count)
-        varying = spread > 1e3 * np.finfo(np.float32).eps * np.abs(mean)
-        weight = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(all_histograms.shape[1] / all_statistics.shape[1])
-        scales = np.where(varying, weight / np.where(varying, spread, 1), 0)
-        for values, part in zip(statistics, parts, strict=True):
-            part.append(np.nan_to_num((values - mean) * scales))
-    source, target = (np.clip(np.rint(np.hstack(part)), -_LARGEST, _LARGEST).astype(np.float32) for part in parts)
-    return source, target
-
-
 def _normals(radius: Float[AnyScalar, ""], points: Rows, neighbors: Rows) -> tuple[Float[Array, "n 3"]]:
     around = neighborhoods(points, neighbors)
     offsets = offsets_of(around)
@@ -134,23 +109,19 @@ def _simple_histograms(
     w = alg.cross(u, v)
     # The angle between the flipped normals is at most π/2.
     theta = jnp.arctan2(alg.dot(w, n), alg.dot(u, n)) / jnp.pi
-    angles = 0.5 + 0.5 * alg.dot(v, n), 0.5 + 0.5 * phi, 0.5 + theta
-    alpha, *others = (_histogram(angle, counted) for angle in angles)
+    # Fractions of the neighbours in each bin, by differences of cumulative counts: XLA may compute a value anew for
+    # each bin, with other rounding, and the value would fall into two bins, or none.
+    total, histograms = jnp.sum(counted, axis=0), []
+    for angle in (0.5 + 0.5 * alg.dot(v, n), 0.5 + 0.5 * phi, 0.5 + theta):
+        below = [jnp.sum(counted & (NUM_BINS * angle < i), axis=0) for i in range(1, NUM_BINS)]
+        cumulative = jnp.stack([jnp.zeros_like(total), *below, total], axis=1)
+        histograms.append(jnp.diff(cumulative, axis=1) / jnp.maximum(total, 1)[:, None].astype(square.dtype))
+    alpha, *others = histograms
     # With the other sign of both normals, φ and θ change theirs.
     even = [0.5 * (histogram + histogram[:, ::-1]) for histogram in others]
     weights = jnp.where(near, 1 / jnp.where(near, square, 1), 0)
     weights = weights / jnp.where(jnp.any(near, axis=0), jnp.sum(weights, axis=0), 1)
     return jnp.concatenate([alpha, *even], axis=1), weights.T
-
-
-def _histogram(values: Float[Array, "k n"], counted: Array) -> Float[Array, "n 11"]:
-    """Fractions of the counted values, from 0 to 1, in each bin."""
-    # Differences of cumulative counts: XLA may compute a value anew for each bin, with other rounding, and the value
-    # would fall into two bins, or none.
-    total = jnp.sum(counted, axis=0)
-    below = [jnp.sum(counted & (NUM_BINS * values < i), axis=0) for i in range(1, NUM_BINS)]
-    cumulative = jnp.stack([jnp.zeros_like(total), *below, total], axis=1)
-    return jnp.diff(cumulative, axis=1) / jnp.maximum(total, 1)[:, None].astype(values.dtype)
 
 
 def _statistics(voxel_size: Float[AnyScalar, ""], points: Rows, neighbors: Rows) -> tuple[Float[Array, "n D"]]:
@@ -175,8 +146,27 @@ def matches_of_features(source: PointCloud, target: PointCloud, voxel_size: floa
     clouds = source, target
     normals = [normals_of(cloud, voxel_size) for cloud in clouds]
     histograms = [histograms_of(clouds[i], normals[i], voxel_size) for i in (0, 1)]
-    statistics = [statistics_of(cloud, voxel_size) for cloud in clouds] if source.channels.shape[1] else None
-    sources, targets = mutual_nearest(*comparable(histograms, statistics), NUM_MATCHES)
+    # On one scale in both clouds.
+    joined = np.concatenate(histograms).astype(np.float64)
+    scale = _DEVIATION / max(float(joined.std()), float(np.finfo(np.float32).tiny))
+    center = joined.mean(axis=0)
+    parts = [[scale * (histogram - center)] for histogram in histograms]
+    if source.channels.shape[1]:
+        # Divided by their standard deviations in both clouds; missing ones are set to the mean.
+        statistics = [statistics_of(cloud, voxel_size) for cloud in clouds]
+        joined = np.concatenate(statistics).astype(np.float64)
+        finite = np.isfinite(joined)
+        count = np.maximum(finite.sum(axis=0), 1)
+        mean = np.where(finite, joined, 0).sum(axis=0) / count
+        spread = np.sqrt(np.where(finite, (joined - mean) ** 2, 0).sum(axis=0) / count)
+        varying = spread > 1e3 * np.finfo(np.float32).eps * np.abs(mean)
+        weight = _CHANNEL_WEIGHT * _DEVIATION * np.sqrt(histograms[0].shape[1] / joined.shape[1])
+        scales = np.where(varying, weight / np.where(varying, spread, 1), 0)
+        for values, part in zip(statistics, parts, strict=True):
+            part.append(np.nan_to_num((values - mean) * scales))
+    # Integers in float32, whose distances are exact.
+    features = [np.clip(np.rint(np.hstack(part)), -_LARGEST, _LARGEST).astype(np.float32) for part in parts]
+    sources, targets = mutual_nearest(features[0], features[1], NUM_MATCHES)
     points = np.asarray(source.points)[sources], np.asarray(target.points)[targets]
     return _padded(*points, normals[0][sources], normals[1][targets])
 

@@ -103,11 +103,22 @@ def hypotheses(
     draw = np.random.default_rng(0).permutation(np.transpose(np.triu_indices(_NUM_PARTNERS, 1)))[:_NUM_TRIPLETS]
     first = jnp.repeat(jnp.arange(NUM_MATCHES), _NUM_TRIPLETS)
     second, third = (partners[:, draw[:, i]].reshape(-1) for i in (0, 1))
-    (from_frame, a), (to_frame, b) = (
-        _triangles(*(points[rows] for rows in (first, second, third))) for points in (matches.source, matches.target)
-    )
-    rotation = jnp.sum(to_frame[:, :, None, :] * from_frame[:, None, :, :], axis=-1)
-    translation = b - jnp.sum(rotation * a[:, None, :], axis=-1)
+
+    def unit(vectors: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
+        length = jnp.sqrt(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
+        return vectors / jnp.where(length > 0, length, 1)
+
+    # The frame of each triangle (columns: along the first edge, across it in the plane, normal; meaningless if
+    # collinear) and its centroid, in both clouds.
+    frames, centroids = [], []
+    for points in (matches.source, matches.target):
+        p, q, r = (points[rows] for rows in (first, second, third))
+        along = unit(q - p)
+        normal = unit(jnp.cross(along, r - p))
+        frames.append(jnp.stack([along, jnp.cross(normal, along), normal], axis=-1))
+        centroids.append((p + q + r) / 3)
+    rotation = jnp.sum(frames[1][:, :, None, :] * frames[0][:, None, :, :], axis=-1)
+    translation = centroids[1] - jnp.sum(rotation * centroids[0][:, None, :], axis=-1)
     agree = (support[first, second] > 0) & (support[first, third] > 0) & (support[second, third] > 0)
     edges = [matches.source[rows] - matches.source[first] for rows in (second, third)]
     area = jnp.sqrt(jnp.sum(jnp.cross(edges[0], edges[1]) ** 2, axis=-1))
@@ -138,20 +149,6 @@ def _support(matches: PutativeMatches, voxel_size: Float[AnyScalar, ""]) -> Floa
     ).astype(jnp.float32)
     # Counts are exact in float32, in any order of the sum.
     return agree * jnp.matmul(agree, agree, precision="highest")
-
-
-def _triangles(
-    p: Float[Array, "T 3"], q: Float[Array, "T 3"], r: Float[Array, "T 3"]
-) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3"]]:
-    """Frame (columns: along the first edge, across it in the plane, normal) and centroid; meaningless if collinear."""
-
-    def unit(vectors: Float[Array, "T 3"]) -> Float[Array, "T 3"]:
-        length = jnp.sqrt(jnp.sum(vectors * vectors, axis=-1, keepdims=True))
-        return vectors / jnp.where(length > 0, length, 1)
-
-    along = unit(q - p)
-    normal = unit(jnp.cross(along, r - p))
-    return jnp.stack([along, jnp.cross(normal, along), normal], axis=-1), (p + q + r) / 3
 
 
 def _scores(

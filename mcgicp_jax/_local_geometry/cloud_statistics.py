@@ -57,7 +57,11 @@ def channel_noise(
             variance = xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
         across.append(xp.where(counts[-1], variance, xp.nan))
     sigma = median(xp.concatenate(residuals, axis=1))
-    low, high = _inner_range(xp.concatenate(sampled)[::_STRIDE])
+    # The quantiles `_INNER`; NaN comes last.
+    sample = xp.sort(xp.concatenate(sampled)[::_STRIDE], axis=0)
+    last = xp.maximum(xp.sum(~xp.isnan(sample), axis=0, keepdims=True) - 1, 0)
+    places = (xp.round(last * xp.asarray(q, sample.dtype)).astype(np.int32) for q in _INNER)
+    low, high = (xp.take_along_axis(sample, place, axis=0)[0] for place in places)
     clipped = xp.concatenate(values)
     clipped = xp.where(low < high, xp.clip(clipped, low, high), clipped)
     spread = of_known(partial(xp.nanstd, axis=0), clipped)
@@ -65,16 +69,6 @@ def channel_noise(
     uniform = ~(spread > _ROUNDINGS * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
-
-
-def _inner_range(sample: Float[AnyArray, "n C"]) -> tuple[Float[AnyArray, "C"], Float[AnyArray, "C"]]:
-    """The quantiles `_INNER` of each channel, ignoring NaN; NaN if there is no other value."""
-    xp = numpy_for(sample)
-    # NaN comes last.
-    ordered, last = xp.sort(sample, axis=0), xp.sum(~xp.isnan(sample), axis=0, keepdims=True) - 1
-    rows = (xp.maximum(last, 0) * xp.asarray(q, sample.dtype) for q in _INNER)
-    low, high = (xp.take_along_axis(ordered, xp.round(row).astype(np.int32), axis=0)[0] for row in rows)
-    return low, high
 
 
 def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:

@@ -68,8 +68,17 @@ Geometries: TypeAlias = Callable[[tuple[Any, Any]], tuple[LocalGeometry, LocalGe
 def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
     offsets, present = offsets_of(around), around.present.astype(around.own.dtype)
     covariance = weighted_covariance(offsets, present)
-    fixed = jax.lax.stop_gradient(offsets)
-    halves, counts = _covariances_of_halves(fixed, present, jax.lax.stop_gradient(covariance))
+    fixed, count = jax.lax.stop_gradient(offsets), jnp.sum(present, axis=0)
+    # Covariances of two halves: every second neighbour, from the first and from the second on. About the mean of all,
+    # so that the sums over one half and over the other add up to those over all.
+    x, y, z = (present * (offset - jnp.sum(offset, axis=0) / jnp.maximum(count, 1)) for offset in fixed)
+    rows = (present, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
+    first = jnp.stack([jnp.sum(row[::2], axis=0) for row in rows])
+    of_all = [count[None], jnp.zeros_like(first[1:4]), count * jax.lax.stop_gradient(covariance)]
+    second = jnp.concatenate(of_all) - first
+    means = [sums[1:] / jnp.maximum(sums[0], 1) for sums in (first, second)]
+    halves = [mean[3:] - alg.outer(mean[:3]) for mean in means]
+    counts = jnp.concatenate([count, first[0], second[0]])
     # One array of whole neighbourhoods and halves compiles faster than three. Without the barriers, XLA would compile
     # the computation of the array again for each use.
     covariances = jax.lax.optimization_barrier(jnp.concatenate([covariance, *halves], axis=1))
@@ -94,22 +103,6 @@ def local_geometry_of(around: Neighborhoods) -> LocalGeometry:
 
 def offsets_of(around: Neighborhoods) -> Offsets:
     return around.offset(0), around.offset(1), around.offset(2)
-
-
-def _covariances_of_halves(
-    offsets: Offsets, present: Float[Array, "k N"], covariance: Float[Array, "6 N"]
-) -> tuple[list[Float[Array, "6 N"]], Float[Array, "M"]]:
-    """Covariances of two halves of each neighbourhood, whose own `covariance` is known: of every second neighbour, from
-    the first and from the second on; and the numbers of neighbours in all, in the first and in the second halves."""
-    count = jnp.sum(present, axis=0)
-    # About the mean of all, so that the sums over one half and over the other add up to those over all.
-    x, y, z = (present * (offset - jnp.sum(offset, axis=0) / jnp.maximum(count, 1)) for offset in offsets)
-    rows = (present, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
-    first = jnp.stack([jnp.sum(row[::2], axis=0) for row in rows])
-    second = jnp.concatenate([count[None], jnp.zeros_like(first[1:4]), count * covariance]) - first
-    means = [sums[1:] / jnp.maximum(sums[0], 1) for sums in (first, second)]
-    halves = [mean[3:] - alg.outer(mean[:3]) for mean in means]
-    return halves, jnp.concatenate([count, first[0], second[0]])
 
 
 def weighted_covariance(offsets: Offsets, weights: Float[Array, "k N"]) -> Float[Array, "6 N"]:
@@ -254,12 +247,9 @@ def _slopes_of_products(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, 
 
 
 class SurfaceNoise(NamedTuple):
-    """Values that only the status and the covariance of the final pose need, most of them as in `LocalGeometry`.
-
-    Attributes:
-        descriptors: variance of the descriptors α · channel about their linear fits, metres², summed over the channels.
-        slopes: gradients of the descriptors; None where channels are not used, and for cells.
-    """
+    """Values that only the status and the covariance of the final pose need, most of them as in `LocalGeometry`; of the
+    descriptors α · channel, the variance about their linear fits, metres², summed over the channels, and the gradients,
+    None where channels are not used, and for cells."""
 
     descriptors: Float[AnyArray, "*batch N"]
     normal: Float[AnyArray, "*batch N 3"]

@@ -95,11 +95,8 @@ class PointRows(NamedTuple):
 
 
 def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
-    """The points and their neighbours as inputs of a row function, for `neighborhoods`.
-
-    Without channels, the programs do not depend on their number. `with_given` includes the covariances given with the
-    cloud.
-    """
+    """The points and their neighbours as inputs of a row function, for `neighborhoods`. Without channels, the programs
+    do not depend on their number. `with_given` includes the covariances given with the cloud."""
     # Neighbours and `valid`, which differentiation does not trace.
     xp = numpy_for(cloud.deferred_neighbors, cloud.valid)
     neighbors, valid = check_neighbors(cloud, xp), xp.asarray(cloud.valid)
@@ -176,11 +173,8 @@ def fit_channels(around: Neighborhoods, x: Float[Array, "k n"], y: Float[Array, 
 
 
 class LinearFit(NamedTuple):
-    """Weighted linear fits over a plane: `inverse` is that of the normal matrix, `weight` the sum of the weights.
-
-    Gradient and inverse are 0 where the points lie on a line; the residual variance is meaningless for three points or
-    fewer.
-    """
+    """Weighted linear fits over a plane: `inverse` is that of the normal matrix, `weight` the sum of the weights. Where
+    the points lie on a line, gradient and inverse are 0; for three points or fewer, the residual is meaningless."""
 
     gradient: Float[Array, "2 ..."]
     residual: Float[Array, "..."]

@@ -48,10 +48,8 @@ def observability_of_halves(
     the certainties of both normals, which are also independent: the certainty of the normal of all neighbours would be
     larger where both halves deviate alike. Where a half is not usable: `geometry_observability` of all neighbours.
 
-    Args:
-        covariances, normals, counts: as in `geometry_observability`, of all neighbours, of the first halves, and of the
-            second halves; M = 3 N.
-        usable: whether the normal of each half may be used; L = 2 N.
+    Covariances, normals and counts are as there, of all neighbours, of the first and of the second halves (M = 3 N);
+    `usable` says of which halves the normals may be used (L = 2 N).
     """
     certain, variance = _certainty(covariances, normals, counts)
     (whole, *of_halves), (normal, first, second) = jnp.split(certain, 3), jnp.split(normals, 3, axis=1)

@@ -217,7 +217,20 @@ def _by_angles(sample: _Sample) -> Float[AnyArray, "C"]:
 
 def _smooth(sample: _Sample) -> Float[AnyArray, "C"]:
     xp = numpy_for(sample)
-    basis = _monomials(sample)
+    # Coordinates about the centroid, which level off far from it.
+    offset = sample.points - sample.points.sum(axis=1, keepdims=True) / xp.maximum(sample.present.sum(), 1)
+    square = (offset * offset).sum(axis=0)
+    level = _LEVEL * median(xp.where(sample.present, xp.sqrt(square), xp.nan))
+    level = xp.where(level > 0, level, 1)
+    bounded = sample.present * offset / xp.sqrt(level**2 + square)
+    # Products of up to `_DEGREE` of them, with a root mean square of 1.
+    products: dict[tuple[int, ...], Any] = {(): xp.ones_like(square)}
+    for degree in range(1, _DEGREE + 1):
+        for axes in combinations_with_replacement(range(3), degree):
+            products[axes] = products[axes[1:]] * bounded[axes[0]]
+    basis = xp.stack(list(products.values()))
+    sizes = xp.sqrt((basis * basis).mean(axis=1, keepdims=True))
+    basis = basis / xp.where(sizes > 0, sizes, 1)
     middle = [_first_half(basis.shape[1])]
     halves = [xp.split(array, middle, axis=1) for array in (basis, sample.weights, sample.channels)]
     # The normal equations of each half, for each channel.
@@ -236,21 +249,3 @@ def _smooth(sample: _Sample) -> Float[AnyArray, "C"]:
 
 def _first_half(num_rows: int) -> int:
     return (num_rows + 1) // 2
-
-
-def _monomials(sample: _Sample) -> Float[AnyArray, "m n"]:
-    """Products of up to `_DEGREE` coordinates about the centroid, which level off far from it; root mean square 1."""
-    xp = numpy_for(sample)
-    count = xp.maximum(sample.present.sum(), 1)
-    offset = sample.points - sample.points.sum(axis=1, keepdims=True) / count
-    square = (offset * offset).sum(axis=0)
-    level = _LEVEL * median(xp.where(sample.present, xp.sqrt(square), xp.nan))
-    level = xp.where(level > 0, level, 1)
-    bounded = sample.present * offset / xp.sqrt(level**2 + square)
-    products: dict[tuple[int, ...], Any] = {(): xp.ones_like(square)}
-    for degree in range(1, _DEGREE + 1):
-        for axes in combinations_with_replacement(range(3), degree):
-            products[axes] = products[axes[1:]] * bounded[axes[0]]
-    rows = xp.stack(list(products.values()))
-    sizes = xp.sqrt((rows * rows).mean(axis=1, keepdims=True))
-    return rows / xp.where(sizes > 0, sizes, 1)

@@ -49,29 +49,15 @@ def spread_rows(valid: Any, count: int) -> Any:
 
 def median(values: Any) -> Any:
     """Median over the last axis that ignores NaN; NaN where all values are NaN. Not meant to be differentiated."""
-    if not is_concrete(values):
-        return _traced_median(values)
-    values = np.asarray(values)
-    result = np.full(values.shape[:-1], np.nan, values.dtype)
-    for index in np.ndindex(values.shape[:-1]):
-        numbers = values[index][~np.isnan(values[index])]
-        if numbers.size:
-            # In float64, in which the sum of the two middle values does not overflow.
-            result[index] = np.median(numbers.astype(np.float64))
-    return result[()]
-
-
-def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) -> Float[AnyArray, "*some C"]:
-    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns of NaN."""
-    xp = numpy_for(values)
-    # NumPy would warn of columns of NaN, and its warning cannot be suppressed in one thread alone.
-    missing = xp.all(xp.isnan(values), axis=0)
-    # Squares of huge values overflow to infinity.
-    with np.errstate(over="ignore", invalid="ignore"):
-        return xp.where(missing, xp.nan, statistic(xp.where(missing, 0, values)))
-
-
-def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    if is_concrete(values):
+        values = np.asarray(values)
+        result = np.full(values.shape[:-1], np.nan, values.dtype)
+        for index in np.ndindex(values.shape[:-1]):
+            numbers = values[index][~np.isnan(values[index])]
+            if numbers.size:
+                # In float64, in which the sum of the two middle values does not overflow.
+                result[index] = np.median(numbers.astype(np.float64))
+        return result[()]
     # Floats are sorted as integers of the same order: XLA on CPUs takes five times as long to sort floats.
     kind = jnp.int32 if values.dtype == jnp.float32 else jnp.int64
 
@@ -87,6 +73,16 @@ def _traced_median(values: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
     middle = jnp.concatenate([jnp.maximum(count - 1, 0) // 2, count // 2], axis=-1)
     # The sum of two large values would overflow.
     return jnp.sum(0.5 * jnp.take_along_axis(ordered, middle, axis=-1), axis=-1)
+
+
+def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) -> Float[AnyArray, "*some C"]:
+    """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns of NaN."""
+    xp = numpy_for(values)
+    # NumPy would warn of columns of NaN, and its warning cannot be suppressed in one thread alone.
+    missing = xp.all(xp.isnan(values), axis=0)
+    # Squares of huge values overflow to infinity.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return xp.where(missing, xp.nan, statistic(xp.where(missing, 0, values)))
 
 
 def cell_numbers(keys: Sequence[Int[AnyArray, "n"]], num_cells: Int[AnyScalar, ""] | int) -> Int[AnyArray, "n"]:

@@ -84,10 +84,8 @@ def symmetric_outer(a: Float[Array, "C 3 N"], b: Float[Array, "C 3 N"]) -> Float
 
 
 def orthonormal_basis(normal: Float[Array, "3 N"]) -> tuple[Float[Array, "3 N"], Float[Array, "3 N"]]:
-    """Two unit vectors that complete the normal to a right-handed frame.
-
-    Duff et al., Building an Orthonormal Basis, Revisited, JCGT 2017.
-    """
+    """Two unit vectors that complete the normal to a right-handed frame (Duff et al., Building an Orthonormal Basis,
+    Revisited, JCGT 2017)."""
     first, second = _basis(*normal)
     return jnp.stack(first), jnp.stack(second)
 

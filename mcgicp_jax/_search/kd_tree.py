@@ -34,6 +34,8 @@ Tree: TypeAlias = Any
 # Where pykdtree is quicker than SciPy's tree, see Constants in `tests/benchmarks/README.md`. Up to seven dimensions the
 # distances of both agree to the last bit, since both add the squared differences in the same order.
 MAX_DIMENSIONS = 4
+# Indices by the content of their target: a pure callback keeps no state, and each tree is built only once.
+_indices = Cache(MAX_ROWS, lambda index: index.num_rows)
 
 
 @functools.cache
@@ -88,11 +90,22 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         running: Bool[Array, ""],
         num_candidates: int = 1,
     ) -> Int[Array, "m N"]:
-        return call_host(
-            partial(_nearest_callback, self, num_candidates),
-            jax.ShapeDtypeStruct((num_candidates, source.valid.shape[0]), jnp.int32),
-            *(pose, source, target, max_distance, running),
-        )
+        shape = (num_candidates, source.valid.shape[0])
+
+        def nearest(
+            pose: Any, source: SearchPoints, target: SearchPoints, max_distance: Any, running: Any
+        ) -> Int[np.ndarray, "m N"]:
+            if not running:
+                return np.full(shape, -1, np.int32)
+            arrays = jax.tree.leaves(target)
+            digest = hashlib.blake2b(repr([self, *((array.shape, array.dtype) for array in arrays)]).encode())
+            for array in arrays:
+                digest.update(np.ascontiguousarray(array).data)
+            index = _indices.get(digest.digest(), partial(self.index, target))
+            return index.nearest(pose, source, float(max_distance), num_candidates)
+
+        result = jax.ShapeDtypeStruct(shape, jnp.int32)
+        return call_host(nearest, result, pose, source, target, max_distance, running)
 
     def neighbors(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Int[np.ndarray, "N k"]:
         return self.neighbors_on_demand(points, num_neighbors).whole
@@ -164,29 +177,6 @@ def _scipy_tree(points: Float[np.ndarray, "M D"]) -> scipy.spatial.cKDTree:
     # Unbalanced trees are built faster and searched as fast. Compact nodes pay off for 20 neighbours, and for one
     # neighbour from the second query on. Leaves of 32 points are a few percent faster than SciPy's default of 16.
     return scipy.spatial.cKDTree(points, leafsize=32, balanced_tree=False, compact_nodes=True)
-
-
-# Indices by the content of their target: a pure callback keeps no state, and each tree is built only once.
-_indices = Cache(MAX_ROWS, lambda index: index.num_rows)
-
-
-def _nearest_callback(
-    search: AbstractTreeSearch,
-    num_candidates: int,
-    pose: Any,
-    source: SearchPoints,
-    target: SearchPoints,
-    max_distance: Any,
-    running: Any,
-) -> Int[np.ndarray, "m N"]:
-    if not running:
-        return np.full((num_candidates, source.valid.size), -1, np.int32)
-    arrays = jax.tree.leaves(target)
-    digest = hashlib.blake2b(repr([search, *((array.shape, array.dtype) for array in arrays)]).encode())
-    for array in arrays:
-        digest.update(np.ascontiguousarray(array).data)
-    index = _indices.get(digest.digest(), partial(search.index, target))
-    return index.nearest(pose, source, float(max_distance), num_candidates)
 
 
 def nearest_in_position(

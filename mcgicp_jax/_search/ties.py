@@ -95,13 +95,11 @@ class TiedTree:
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float = np.inf
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest points of each query (all points if there are fewer), ordered by distance and then row.
+        """Rows of the k nearest points of each query (all points if there are fewer), ordered by distance and then row;
+        M for none within `bound`. And the slack: half the gap between the k-th nearest and the next, which is taken to
+        lie at the bound if none is within it; 0 without a k-th nearest.
 
         Trees return ties in any order. Searching for k + 1 neighbours reveals ties, which are then resolved.
-
-        Returns:
-            Rows of `points`, M standing for none within `bound`; and the slack: half the gap between the k-th nearest
-            and the next, which is taken to lie at the bound if none is within it; 0 without a k-th nearest.
         """
         if self._rows is not None and k >= self._most_equal:
             return TiedTree(self._trees, self.points, k + 1).nearest(queries, k, bound)
@@ -128,26 +126,19 @@ class TiedTree:
             if tied.size:
                 distances, rows = self.query(queries[tied], asked, bound)
         if tied.size and asked < size:
-            nearest[tied] = _nearest_in_all(self._held, queries[tied], farthest[tied], k)
+            # Brute force, for queries with long ties. Such queries mostly coincide, too.
+            distinct, first, whose = np.unique(queries[tied], axis=0, return_index=True, return_inverse=True)
+            in_all = np.empty((len(distinct), k), np.int32)
+            for i, (query, limit) in enumerate(zip(distinct, farthest[tied][first], strict=True)):
+                squares = np.zeros(size)
+                # In float64, as trees compute.
+                for column, value in zip(self._held.T.astype(np.float64), query, strict=True):
+                    squares += (column - value) ** 2
+                # A part in a billion covers rounding.
+                near = np.flatnonzero(squares <= limit**2 * (1 + 1e-9))
+                in_all[i] = near[np.lexsort((near, squares[near]))[:k]]
+            nearest[tied] = in_all[whose.ravel()]
         return nearest if self._rows is None else self._rows[nearest].astype(np.int32), slack
-
-
-def _nearest_in_all(
-    points: Float[np.ndarray, "M D"], queries: Float[np.ndarray, "N D"], farthest: Float[np.ndarray, "N"], k: int
-) -> Int[np.ndarray, "N k"]:
-    """Brute force, for queries with long ties; `farthest`: distance of the k-th neighbour, metres."""
-    # Such queries mostly coincide, too.
-    queries, first, whose = np.unique(queries, axis=0, return_index=True, return_inverse=True)
-    nearest = np.empty((len(queries), k), np.int32)
-    for i, (query, limit) in enumerate(zip(queries, farthest[first], strict=True)):
-        squares = np.zeros(len(points))
-        # In float64, as trees compute.
-        for column, value in zip(points.T.astype(np.float64), query, strict=True):
-            squares += (column - value) ** 2
-        # A part in a billion covers rounding.
-        near = np.flatnonzero(squares <= limit**2 * (1 + 1e-9))
-        nearest[i] = near[np.lexsort((near, squares[near]))[:k]]
-    return nearest[whose.ravel()]
 
 
 def slack_of(farthest: Float[np.ndarray, "N"], following: Float[np.ndarray, "N"]) -> Float[np.ndarray, "N"]:

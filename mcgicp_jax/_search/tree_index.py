@@ -57,15 +57,11 @@ class TreeIndex(AbstractIndex):
     def nearest_of(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"] | None, max_distance: float, k: int
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest rows of each query.
+        """The k nearest target rows of each query, −1 for none; and the slack: the distance, metres, that a query may
+        move before these rows can change, but for their order.
 
-        Args:
-            queries: positions and descriptors, metres; rows that are not finite have no neighbours.
-            penalty: of the queries, as in `SearchPoints`.
-
-        Returns:
-            (N, k) target rows, −1 for none; and (N,) the slack: the distance, metres, that a query may move before its
-            k nearest rows can change, but for their order.
+        Queries are positions and descriptors, metres, with a `penalty` as in `SearchPoints`; those that are not finite
+        have no neighbours.
         """
         indices, slack = np.full((len(queries), k), -1, np.int32), np.zeros(len(queries))
         if not self._rows.size:
