@@ -49,7 +49,7 @@ class PoseGraphResult:
     weights: Float[Array, "m"] | Float[np.ndarray, "m"]
     factor_residuals: tuple[AnyArray, ...]
     factor_weights: tuple[AnyArray, ...]
-    num_redundant: Float[ArrayLike, ""]
+    num_redundant: Any
     uncertainty: Lazy[Any]
 
     @property
