@@ -296,6 +296,10 @@ def test_a_cloud_goes_through_jit():
     assert not np.any(through.origin)
     flat, structure = jax.tree.flatten(cloud)
     assert_same(jax.tree.unflatten(structure, flat), cloud)
+    # Of a cloud whose neighbours are still to be found, the lowered function has the same structure.
+    fresh = preprocess(raw(), num_neighbors=4)
+    compiled = jax.jit(lambda cloud: cloud.neighbors).lower(fresh).compile()
+    np.testing.assert_array_equal(compiled(fresh), fresh.neighbors)
 
 
 def test_repr_is_short_and_says_what_matters():

@@ -1,6 +1,7 @@
 """What is known of an initial pose decides how far matches may be; a right one is not left."""
 
 import warnings
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -8,6 +9,9 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
+from mcgicp_jax._math.poses import matrix_of, se3_from_matrix
+from mcgicp_jax._registration import register_pair
+from mcgicp_jax._registration.start_check import SurfaceFit, doubt_of_start
 from tests.promise_scenes import office, translation, views
 from tests.scenes import motion, room_corner
 
@@ -111,6 +115,26 @@ def test_a_pose_far_from_the_initial_one_is_unverified_if_surfaces_coincide_near
     with pytest.warns(UserWarning, match=r"4\.\d m from this one, where the surfaces coincide about as well"):
         result = mcg.register(corridor(count, 5, 16, 2 * seed + 1), corridor(count, 0, 11, 2 * seed), GICP)
     assert result.status is Status.UNVERIFIED
+
+
+@pytest.mark.parametrize(
+    ("metres", "by_channels", "is_doubted"), [(3.1, False, True), (2.9, False, False), (3.1, True, False)]
+)
+def test_a_pose_further_off_than_half_the_coarse_distance_is_doubted(monkeypatch, metres, by_channels, is_doubted):
+    """However well surfaces coincide and however many match; in an aisle of shelves, another bay was CONVERGED."""
+    calls = []
+    monkeypatch.setattr(register_pair, "doubt_of_start", lambda *arguments: calls.append(arguments))
+    pair = office(0, 500)
+    mcg.register(pair.source, pair.target, GICP, max_distance=(6.0, 0.5))
+    ((_, state, settings, *_),) = calls
+    state = state._replace(
+        status=np.int32(Status.CONVERGED),
+        record=state.record._replace(num_inliers=10_000),
+        directions=replace(state.directions, geometry=np.zeros(6), channels=np.full(6, float(by_channels))),
+    )
+    away = se3_from_matrix(translation(metres, 0, 0) @ matrix_of(state.pose), np.float32)
+    doubt = doubt_of_start(away, state, settings, lambda: SurfaceFit(0.9, 0.9))
+    assert (doubt is not None) == is_doubted and (doubt is None or doubt.by_shape)
 
 
 @pytest.mark.parametrize("shift", [(0.5, 0, 0), (0, 0.5, 0)])

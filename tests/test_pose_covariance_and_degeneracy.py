@@ -495,6 +495,21 @@ def test_deviations_contain_the_steps_of_one_axis():
     assert (coarse.deviations[[3, 5]] > 0.005).all()
 
 
+def test_deviations_contain_the_steps_of_whole_disparities():
+    """As of a stereo camera that looks along z: a step s of 1/z is one of z² s, and no step of z fits."""
+    source, target, truth = pair(size=2000)
+    ahead, step = motion((0, 0, 3, 0, 0, 0)), 1 / 60
+    points = np.asarray(source.coordinates) + ahead[:3, 3]
+    depth = points[:, 2:]
+    rounded = points * (1 / (np.rint(1 / depth / step) * step)) / depth
+    start = truth @ np.linalg.inv(ahead)
+    fine, coarse = (
+        mcg.register(mcg.preprocess(each, None), target, mcg.GICP(), init=start) for each in (points, rounded)
+    )
+    assert (fine.deviations < 0.005).all()
+    assert coarse.deviations[2] > 0.9 * np.median(depth) ** 2 * step / np.sqrt(12)
+
+
 @pytest.mark.slow
 def test_traced_and_batched_results_agree_with_single_ones():
     """Clouds of several sizes, stacked."""

@@ -1,7 +1,8 @@
 """The step to which coordinates are rounded, whatever wrote them: voxel centres, integers, few digits, float32.
 
 Points on a lattice as coarse as their spacing match the lattice of another cloud rather than its surfaces. A step shows
-in the gaps between the sorted coordinates along an axis, which are multiples of it.
+in the gaps between the sorted coordinates along an axis, which are multiples of it. Depths of whole disparities show it
+in the gaps between their inverses.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._math.statistics import sampled_rows
+from mcgicp_jax._math.statistics import median, sampled_rows
 
 # Steps below this fraction of the spacing do no harm: in rooms of 5,000 points, errors are those without steps up to
 # 0.35, three times as large at 0.5, and with deviations that are seven times too small.
@@ -50,27 +51,39 @@ def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]
     rows, counts = sampled_rows(cloud.valid)
     xp = numpy_for(cloud.points, counts)
     values = xp.where(counts, xp.asarray(cloud.points)[rows].T, xp.nan)
-    largest = xp.max(xp.where(xp.isfinite(values), xp.abs(values), 0), axis=1, keepdims=True)
     # Coordinates that overflow, or are missing, leave no gap.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        gaps = xp.diff(xp.sort(values, axis=1), axis=1)
-        distinct = gaps > _ROUNDINGS * xp.finfo(gaps.dtype).eps * largest
-        number: Any = xp.sum(distinct, axis=1, keepdims=True)
-        # Rounded coordinates repeat.
-        rounded = (number > 1) & (2 * number < xp.sum(counts))
-        if xp is np and not rounded.any():
-            return np.zeros(3, gaps.dtype), np.zeros(3, bool)
-        ordered = xp.sort(xp.where(distinct, gaps, xp.inf), axis=1)
-        step = xp.take_along_axis(ordered, number // _QUANTILE, axis=1)
-        multiple = xp.where(distinct, gaps, 0) / step
-        fits = xp.abs(multiple - xp.round(multiple)) < _TOLERANCE
-        near = distinct & (multiple < _MULTIPLES)
-        rounded = rounded & xp.isfinite(step) & (xp.sum(near) >= _LEAST_GAPS)
-        rounded = rounded & (xp.sum(near & fits, axis=1, keepdims=True) >= _FIT * xp.sum(near, axis=1, keepdims=True))
+        step = _step_between(values)
+        if xp is np and np.isnan(step).all():
+            return np.zeros(3, values.dtype), np.zeros(3, bool)
         # The step of float32 at these coordinates, by its 23 bits of fraction.
-        size = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1, keepdims=True)
+        size = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1)
         float32 = xp.abs(step * 2.0 ** (23 - xp.floor(xp.log2(size))) - 1) < _TOLERANCE
-    return xp.where(rounded, step, 0)[:, 0].astype(gaps.dtype), float32[:, 0]
+        # A step s of 1/z is one of z² s at the depth z.
+        step = xp.where(step > 0, step, _step_between(1 / values) * median(values**2))
+    return xp.where(step > 0, step, 0).astype(values.dtype), float32
+
+
+def _step_between(values: Float[AnyArray, "3 n"]) -> Float[AnyArray, "3"]:
+    """The step of which the gaps between values are multiples; 0 where there is none, NaN where few values repeat."""
+    xp = numpy_for(values)
+    known = xp.isfinite(values)
+    largest = xp.max(xp.where(known, xp.abs(values), 0), axis=1, keepdims=True)
+    gaps = xp.diff(xp.sort(values, axis=1), axis=1)
+    distinct = gaps > _ROUNDINGS * xp.finfo(gaps.dtype).eps * largest
+    number: Any = xp.sum(distinct, axis=1, keepdims=True)
+    # Rounded coordinates repeat.
+    repeat = (number > 1) & (2 * number < xp.sum(known, axis=1, keepdims=True))
+    if xp is np and not repeat.any():
+        return np.full(3, np.nan, gaps.dtype)
+    ordered = xp.sort(xp.where(distinct, gaps, xp.inf), axis=1)
+    step = xp.take_along_axis(ordered, number // _QUANTILE, axis=1)
+    multiple = xp.where(distinct, gaps, 0) / step
+    fits = xp.abs(multiple - xp.round(multiple)) < _TOLERANCE
+    near = distinct & (multiple < _MULTIPLES)
+    rounded = repeat & xp.isfinite(step) & (xp.sum(near) >= _LEAST_GAPS)
+    rounded = rounded & (xp.sum(near & fits, axis=1, keepdims=True) >= _FIT * xp.sum(near, axis=1, keepdims=True))
+    return xp.where(rounded, step, xp.where(repeat, 0, xp.nan))[:, 0]
 
 
 def _shows_rounding(cloud: PointCloud, coarse: Bool[AnyArray, "3"], steps: Float[AnyArray, "3"]) -> Any:

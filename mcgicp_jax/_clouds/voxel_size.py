@@ -44,7 +44,8 @@ _MOST_LINES = 0.05
 # Where no size reaches that, the fraction must fall to this part of what it was; in a planar scan it does not fall.
 _FEWER = 0.5
 # Median thickness of neighbourhoods (third extent over the second) from which larger voxels are tried. Raw corridors
-# that noise made look constrained had 0.4 and more, and 20 points that fill a ball have 0.77.
+# that noise made look constrained had 0.4 and more, and 20 points that fill a ball have 0.77. Voxels that leave few
+# lines are no larger than this allows, either: in a forest few are lines only where voxels mix trunks with the ground.
 _THICK = 0.3
 # Larger voxels are used if the thickness falls below `_THICK`, and to the fraction `_THINNER` or less per doubling;
 # they are given up if it rises by the factor `_THICKER` (measured: Constants in `tests/benchmarks/README.md`).
@@ -225,7 +226,8 @@ def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
 
 
 def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) -> int | None:
-    """The smallest size with few lines, or else the largest at which all clouds show the scene; None: there is none."""
+    """The smallest size with few lines, or else the largest at which all clouds show the scene and neighbourhoods are
+    no thicker than they may be: trunks are lines until voxels mix them with the ground. None: there is none."""
 
     def suffices(cloud: _Averages, larger: int) -> bool:
         return not cloud.shows_scene(larger) or cloud.shape(larger).lines <= _MOST_LINES
@@ -236,7 +238,10 @@ def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) 
     for cloud in others:
         while larger < steps.stop and not suffices(cloud, larger):
             larger += 1
-    while larger >= steps.start and not all(cloud.shows_scene(larger) for cloud in clouds):
+    thick = max(_THICK, _worst_shape(clouds, step).thickness)
+    while larger >= steps.start and not (
+        all(cloud.shows_scene(larger) for cloud in clouds) and _worst_shape(clouds, larger).thickness <= thick
+    ):
         larger -= 1
     return larger if larger >= steps.start else None
 

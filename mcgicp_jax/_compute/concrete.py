@@ -41,6 +41,7 @@ class DeferredRows:
     ):
         self.shape, self._anew = shape, anew
         self._table = RowsOnDemand(compute, shape[0])
+        self._stand_in: Any = None
 
     def __getitem__(self, rows: Any) -> np.ndarray:
         return self._table.computed(rows)[rows]
@@ -53,11 +54,17 @@ class DeferredRows:
         return rows
 
     def tree_flatten(self) -> tuple[tuple[np.ndarray], None]:
-        return (self.whole,), None
+        return (self.whole if self._stand_in is None else self._stand_in,), None
 
     @classmethod
     def tree_unflatten(cls, _: None, children: tuple[Any]) -> Any:
-        return children[0]
+        (rows,) = children
+        if isinstance(rows, np.ndarray | jax.Array):
+            return rows
+        # What stands for the array, such as its shape in `jit(...).lower`, keeps the structure of the tree.
+        node = object.__new__(cls)
+        node._stand_in = rows
+        return node
 
     def __reduce__(self) -> Any:
         return (np.asarray, (self.whole,)) if self._anew is None or self._table.complete else (self._anew, ())

@@ -158,9 +158,10 @@ def doubt_of_start(
     fit = measure_fit()
     few = bool(state.record.num_inliers < _MANY)
     little = bool(fit.overlap < _LITTLE_IN_COMMON) and not at_scales
-    by_shape = few and not np.any(cast(Directions, state.directions).constrained_by_channels)
-    far = moved > _FAR * settings.max_distance or state.status == Status.DEGENERATE
-    left = fit.fit < (_GOOD_FIT if few else _LEAST_FIT) or little or (by_shape and far and not at_scales)
+    far = bool(moved > _FAR * settings.max_distance)
+    by_shape = (few or far) and not np.any(cast(Directions, state.directions).constrained_by_channels)
+    slid = far or state.status == Status.DEGENERATE
+    left = fit.fit < (_GOOD_FIT if few else _LEAST_FIT) or little or (by_shape and slid and not at_scales)
     changing = not (left or at_scales) and state.status == Status.MAX_ITERATIONS
     return Doubt(fit, moved, little, few, by_shape, changing) if left or changing else None
 
