@@ -8,10 +8,8 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
-from mcgicp_jax.datasets._raycast import Box, Cylinder, cast
 from tests.precision import in_float64
 from tests.refusals import refused
-from tests.scenes import motion
 
 RNG = np.random.default_rng(0)
 
@@ -84,26 +82,6 @@ def test_noise_is_averaged_and_warned_of_where_no_voxels_are_asked_for(thick):
     assert thickness(thick[::4]) > 0.4 and thickness(cloud.points) < 0.35
     with pytest.warns(UserWarning, match=r"^voxel_size: .*0\.\d+ times"):
         mcg.preprocess(thick, None)
-
-
-def test_voxels_are_not_so_large_that_they_mix_trunks_with_the_ground():
-    """In a forest seen by 16 beams, neighbourhoods of trunks are lines in any voxels that show them. In voxels so large
-    that few are, the pose is 0.24 m off."""
-    rng = np.random.default_rng(0)
-    feet = [place for place in rng.uniform(-40, 40, (150, 2)) if np.hypot(*place) > 3]
-    solids = [Cylinder(np.append(foot, 0), rng.uniform(0.1, 0.35), rng.uniform(5, 12)) for foot in feet]
-    solids.append(Box(np.array([-100.0, -100, -1]), np.array([100.0, 100, 0])))
-    elevation, azimuth = np.meshgrid(np.radians(np.linspace(-15, 15, 16)), np.arange(0, 2 * np.pi, np.pi / 900))
-    across = np.cos(elevation) * np.stack([np.cos(azimuth), np.sin(azimuth)])
-    rays = np.stack([*across, np.sin(elevation)], axis=-1).reshape(-1, 3)
-    poses = motion((0, 0, 1.7, 0, 0, 0)), motion((0.6, 0.1, 1.7, 0.01, -0.01, 0.05))
-    hits = [cast(pose, rays, solids, 80) for pose in poses]
-    target, source = (
-        seen.sensor_rays * (seen.distance + 0.02 * rng.normal(size=len(seen.distance)))[:, None] for seen in hits
-    )
-    result = mcg.register(source, target, mcg.GICP())
-    error, _ = mcg.metrics.pose_error(result.matrix, np.linalg.inv(poses[0]) @ poses[1])
-    assert result.converged and error < 0.05
 
 
 def test_large_clouds_keep_at_most_40_000_voxels():

@@ -149,7 +149,8 @@ class PointCloud(eqx.Module):
         channel_valid: (N, C), False where the point lacks the channel, as outside a camera's view; the value there is
             0 and is ignored. None: all points have all channels.
         valid: (N,), False for padding.
-        deferred_neighbors: value of the property `neighbors`, of which some rows may not be found yet.
+        deferred_neighbors: value of the property `neighbors`, of which some rows may not be found yet. All are in
+            `jax.tree.map(np.asarray, cloud)`, which has the structure that the carry of `jax.lax.scan` must keep.
         voxels: how the points were averaged, see `voxel_size`.
         covariances: (N, 3, 3), or None. If given, methods use them instead of computing their own: dimensionless for
             GICP and MC-GICP, m² for NDT (from `voxel_gaussians`; the scale of a kernel is then in standard deviations).
