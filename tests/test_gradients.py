@@ -204,14 +204,8 @@ def in_first_lane(inputs, source, target, start):
     return lane(gradients_in_lanes(inputs, source, target, np.stack([start] * 3)), 0)
 
 
-def test_inside_jit_no_matches_give_no_gradient_and_identical_clouds_a_finite_one(padded):
-    source, target = padded
-    inputs = inputs_of(source, target, *case("mc-gicp"))
-    far = inputs | {"source points": inputs["source points"] + 100}
-    gradient, result = in_first_lane(far, source, target, motion())
-    assert result.status is Status.TOO_FEW_CORRESPONDENCES
-    for leaf in jax.tree.leaves(gradient):
-        np.testing.assert_array_equal(leaf, 0)
+def test_inside_jit_identical_clouds_have_a_finite_gradient(padded):
+    source, _ = padded
     gradient, result = in_first_lane(inputs_of(source, source, *case("mc-gicp")), source, source, np.eye(4))
     assert np.isfinite(gradient["source points"]).all()
     np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-5)

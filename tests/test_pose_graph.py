@@ -216,6 +216,7 @@ def test_covariances_are_those_of_finite_differences():
     covariance = np.linalg.inv(derivative.T @ derivative)
     expected = covariance.reshape(size // 6, 6, size // 6, 6)[np.arange(size // 6), :, np.arange(size // 6)]
     np.testing.assert_allclose(found.covariance[1:], expected, atol=1e-3 * expected.max())
+    np.testing.assert_array_equal(found.covariance[0], 0)
 
 
 def test_other_sizes_compile_nothing():
@@ -378,20 +379,6 @@ def test_an_exact_graph_ends_at_the_truth():
     found = mcg.optimize_poses(mcg.PoseGraph(graph.poses, exact))
     assert found.converged and found.cost < 1e-10
     np.testing.assert_allclose(found.poses, poses, atol=1e-7)
-
-
-def test_covariances_are_those_of_simulation():
-    """NEES of the poses over many noises; and the spread, pose by pose."""
-    poses, loops = grid(2)
-    squares, twists = [], []
-    for seed in range(60):
-        found = mcg.optimize_poses(measured(poses, loops, seed=seed)[0], robust=False)
-        error = logarithm(np.linalg.inv(found.poses) @ poses)
-        twists.append(error)
-        squares.append([e @ np.linalg.solve(c, e) for e, c in zip(error[1:], found.covariance[1:], strict=True)])
-    assert 0.9 < np.mean(squares) / 6 < 1.1
-    np.testing.assert_allclose(np.std(twists, axis=0)[-1], np.sqrt(np.diag(found.covariance[-1])), rtol=0.35)
-    np.testing.assert_array_equal(found.covariance[0], np.zeros((6, 6)))
 
 
 def test_double_edges_count_twice():
