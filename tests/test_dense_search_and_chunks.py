@@ -124,17 +124,6 @@ def clouds(raw):
     return [[mcg.preprocess(pair[side], None, num_neighbors=15) for pair in raw] for side in (0, 1)]
 
 
-def test_matches_are_those_of_the_tree(clouds):
-    source, target = clouds[0][0], clouds[1][0]
-    for method in (mcg.PointToPoint(), mcg.ColorICP(0.3)):
-        found = [
-            mcg.find_correspondences(source, target, T, method, max_distance=0.4, search=search)
-            for search in (KDTreeSearch(), DenseSearch())
-        ]
-        np.testing.assert_array_equal(found[0].valid, found[1].valid)
-        np.testing.assert_array_equal(found[0].indices[found[0].valid], found[1].indices[found[1].valid])
-
-
 def test_preprocess_and_register_agree_with_the_tree(raw):
     results = []
     for search in (KDTreeSearch(), DenseSearch()):
@@ -257,20 +246,6 @@ def test_pairs_of_shapes_that_the_method_refuses(raw):
     with pytest.warns(mcg.PairWarning, match="pair [01]: channel_weights: "):
         results = mcg.register_batch(*sides, method, max_distance=0.5, search=DenseSearch())
     assert [result.status for result in results] == [Status.INVALID_INPUT] * 2
-
-
-@pytest.mark.slow
-def test_a_bad_pair_spoils_no_other(clouds):
-    expected = in_chunks(*clouds)
-    sources, targets = (list(side) for side in clouds)
-    sources[0], targets[4] = np.array(5.0), np.full((9, 3), np.nan)
-    starts = [None, motion((100.0, 0, 0, 0, 0, 0)), None, None, None, None]
-    with pytest.warns(UserWarning, match="pair [04]"):
-        results = in_chunks(sources, targets, init=starts)
-    assert [result.status for result in results[:2]] == [Status.INVALID_INPUT, Status.TOO_FEW_CORRESPONDENCES]
-    assert results[4].status is Status.INVALID_INPUT
-    for i in (2, 3, 5):
-        assert_same(results[i : i + 1], expected[i : i + 1])
 
 
 @pytest.mark.slow

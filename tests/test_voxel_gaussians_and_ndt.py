@@ -53,15 +53,6 @@ def test_statistics_are_those_of_numpy():
     assert np.bincount(cells[cells >= 0]).min() >= 6
 
 
-def test_cells_of_a_plane_along_the_axes_are_not_biased():
-    """At z = 0 a grid along the axes would cut it in two layers of cells, whose means are 0.8 σ off."""
-    rng = np.random.default_rng(0)
-    points = np.column_stack([rng.uniform(-3, 3, (6000, 2)), 0.01 * rng.normal(size=6000)])
-    cells, counts = mcg.voxel_gaussians(points, SIZE, return_counts=True)
-    heights = cells.points[:, 2] / (0.01 / np.sqrt(counts))
-    assert len(cells) > 200 and np.sqrt(np.mean(heights**2)) < 1.3
-
-
 def test_counts():
     points, _ = room_corner(3000)
     cloud, counts = mcg.voxel_gaussians(points, SIZE, return_counts=True)
