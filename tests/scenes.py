@@ -9,7 +9,6 @@ import numpy as np
 import mcgicp_jax as mcg
 from mcgicp_jax._methods.surfaces import searchable, surface_pair, surface_table
 from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
-from mcgicp_jax._pose_solver.sums import sums_of
 from tests.reference import pose
 
 
@@ -66,11 +65,6 @@ def matched_at(source, target, method, pose, matches, robust=None, temperature=N
     pose = jnp.asarray(pose, source.points.dtype)
     matched = jax.jit(match_surfaces)(both.source, both.target, Matches.given(matches, temperature))
     return matched, both, Motion(pose[:3, :3], pose[:3, 3])
-
-
-def sums_at(pose, matched, both):
-    """The sums that update a pose, (4, 4), from `matched_at`."""
-    return sums_of(Motion(pose[:3, :3], pose[:3, 3]), matched, both.terms, 0.0, np.bool_(True))
 
 
 def rectangles(*sides: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]) -> Callable[..., np.ndarray]:

@@ -179,18 +179,6 @@ def test_gradient_by_every_input_agrees_with_central_differences(name, way):
         assert np.abs(gradient["method"].channel_weights).min() > 1e-4 and gradient["temperature"] != 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in CASES if "missing" in name])
-def test_what_stands_where_a_channel_is_missing_has_gradient_0(name):
-    problem = problem_of(name)
-    valid = {f"{side} channels": np.asarray(cloud.channel_valid) for side, cloud in sides(problem.clouds)}
-    unseen = {key: jnp.where(valid[key], problem.inputs[key], jnp.nan) for key in valid}
-    gradient = problem.compiled(problem.inputs | unseen)
-    for key in valid:
-        assert np.isfinite(gradient[key]).all()
-        np.testing.assert_array_equal(gradient[key][~valid[key]], 0)
-
-
 def sides(clouds):
     return zip(("source", "target"), clouds, strict=True)
 

@@ -120,11 +120,13 @@ def test_pairs_are_those_of_largest_overlap_at_ever_larger_gaps():
     assert found.registrations.keys() == {*consecutive, (0, 3), (1, 4), (0, 4), (4, 6), (1, 6), (4, 7), (0, 7)}
 
 
-def test_pairs_and_starts_can_be_given(room):
+def test_pairs_starts_and_an_executor_can_be_given(room):
     frames, truth = room
     clouds = [frame.cloud for frame in frames[:3]]
-    found = mcg.multiway(clouds, mcg.GICP(), [(0, 1), (0, 2)], init=truth[:3], max_distance=1.0)
-    assert found.converged and set(found.registrations) == {(0, 1), (0, 2)}
+    with ThreadPoolExecutor(1) as threads:
+        options = {"init": truth[:3], "max_distance": 1.0, "executor": threads}
+        found = mcg.multiway(clouds, mcg.GICP(), [(0, 1), (0, 2)], **options)
+    assert threads._threads and found.converged and set(found.registrations) == {(0, 1), (0, 2)}
     np.testing.assert_allclose(found.poses[2], truth[0] @ found.registrations[0, 2].matrix, atol=1e-6)
     alone = mcg.multiway(clouds, mcg.GICP(), [(0, 1)], init=truth[:3], max_distance=1.0)
     assert alone.graph.status == mcg.Status.DEGENERATE
@@ -262,14 +264,6 @@ def test_far_points_cost_no_registrations():
     found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
     assert np.isfinite(found.poses).all() and len(found.registrations) >= 2
     refused(lambda: found.map, "clouds[1]", "voxels")
-
-
-def test_pairs_that_are_given_are_registered_by_the_executor():
-    clouds = [frame.cloud for frame in datasets.box_room(3, points_per_frame=800)]
-    with ThreadPoolExecutor(1) as threads:
-        start = [np.eye(4)] * 3
-        found = mcg.multiway(clouds, mcg.GICP(), [(0, 1), (0, 2)], init=start, max_distance=1.0, executor=threads)
-    assert threads._threads and found.registrations.keys() == {(0, 1), (0, 2)}
 
 
 def test_outputs_in_the_folder_are_no_inputs(room, tmp_path, capsys):
