@@ -39,12 +39,17 @@ def wall(size: int, noise: float = 0.002, seed: int = 0):
     return points, paint + 0.01 * rng.normal(size=paint.shape)
 
 
-def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, **settings):
-    """Preprocessed source and target, sampled independently, and the true T_target_source."""
+def raw_pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, seed: int = 1, **settings):
+    """Source and target, sampled independently, and the true T_target_source."""
     truth = motion() if truth is None else truth
-    points, channels = scene(size, seed=1, **settings)
+    points, channels = scene(size, seed=seed, **settings)
     source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
-    target = mcg.PointCloud(*scene(size, seed=2, **settings))
+    return source, mcg.PointCloud(*scene(size, seed=seed + 1, **settings)), truth
+
+
+def pair(*arguments, **settings):
+    """Those of `raw_pair`, preprocessed."""
+    source, target, truth = raw_pair(*arguments, **settings)
     return mcg.preprocess(source), mcg.preprocess(target), truth
 
 

@@ -21,7 +21,7 @@ from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64
-from tests.reference import pose, symmetric
+from tests.reference import logarithm, pose, symmetric
 from tests.refusals import refused
 from tests.scenes import SURFACES, motion, pair, prepare, wall
 
@@ -485,9 +485,7 @@ def test_normalised_squared_errors_are_one_on_average(method):
             for name, frame in (("source", source), ("target", target))
         ]
         result = mcg.register(*clouds, method, init=truth, max_distance=0.5)
-        left = np.linalg.inv(truth) @ result.matrix
-        error = np.append(left[:3, 3], [left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]])
-        error[3:] *= 0.5
+        error = logarithm(np.linalg.inv(truth) @ result.matrix)
         squares.append(error @ np.linalg.solve(np.asarray(result.covariance, np.float64), error) / 6)
     assert 0.5 < np.mean(squares) < 1.9
 

@@ -15,7 +15,7 @@ from mcgicp_jax import Status
 from mcgicp_jax.metrics import pose_error
 from tests.precision import in_both_precisions, tolerance
 from tests.refusals import refused
-from tests.scenes import motion, pair, room_corner, wall
+from tests.scenes import motion, pair, raw_pair, room_corner, wall
 
 METHODS = {
     "point-to-point": mcg.PointToPoint,
@@ -105,12 +105,10 @@ def test_identical_clouds_converge_in_one_iteration(room):
 
 @pytest.mark.parametrize("robust", [mcg.Huber, mcg.Tukey])
 def test_robust_kernels_resist_outliers(robust):
-    truth = motion()
-    points, channels = room_corner(2000, seed=1)
-    target = mcg.preprocess(mcg.PointCloud(*room_corner(2000, seed=2)))
+    source, target, truth = raw_pair()
     # A fifth of the source has been lifted, all of it in one direction.
-    points[:400] += [0.0, 0.0, 0.3]
-    source = mcg.preprocess(mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels))
+    source.points[:400] += [0.0, 0.0, 0.3] @ truth[:3, :3]
+    source, target = mcg.preprocess(source), mcg.preprocess(target)
     plain = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
     kernel = mcg.register(source, target, mcg.GICP(), max_distance=0.5, robust=robust(1.0))
     assert kernel.converged
