@@ -190,21 +190,6 @@ def test_the_command_of_odometry(tmp_path, capsys):
     assert "loops:     " in capsys.readouterr().out and len(io.read(map)) > 1000
 
 
-@pytest.mark.slow
-def test_a_cloud_of_another_place_leaves_the_others_where_they_are():
-    size = {"points_per_frame": 1500, "step": 0.4}
-    frames, other = datasets.box_room(6, seed=3, **size), datasets.box_room(6, seed=1003, **size)
-    clouds = [mcg.PointCloud(frame.cloud.points) for frame in frames]
-    clouds[4] = mcg.PointCloud(other[4].cloud.points)
-    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
-    others = [0, 1, 2, 3, 5]
-    truth = np.array([frames.path(k) for k in others])
-    np.testing.assert_allclose(
-        np.linalg.inv(found.poses[0]) @ found.poses[others], np.linalg.inv(truth[0]) @ truth, atol=0.05
-    )
-    assert all(found.statuses[k] == mcg.Status.CONVERGED for k in others)
-
-
 @pytest.mark.parametrize(
     ("seed", "alien", "step"),
     [
@@ -224,6 +209,7 @@ def test_a_cloud_of_another_place_does_not_spoil_the_motions_that_follow(seed, a
     clouds[alien] = mcg.PointCloud(np.asarray(other[alien].cloud.points, np.float32))
     found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
     others = [k for k in range(7) if k != alien]
+    assert all(found.statuses[k] == mcg.Status.CONVERGED for k in others)
     truth, poses = np.array([frames.path(k) for k in others]), found.poses[others]
     np.testing.assert_allclose(np.linalg.inv(poses[0]) @ poses, np.linalg.inv(truth[0]) @ truth, atol=0.05)
 
