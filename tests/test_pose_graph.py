@@ -12,18 +12,7 @@ from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from tests.compilations import compilations
-from tests.graphs import (
-    SMALL,
-    Height,
-    correlated,
-    grid,
-    joined,
-    measured,
-    moved,
-    shifted,
-    with_factors,
-    with_priors,
-)
+from tests.graphs import SMALL, Height, correlated, grid, joined, measured, moved, shifted, with_factors, with_priors
 from tests.reference import exponential, logarithm
 from tests.refusals import refused
 from tests.scenes import motion

@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from tests.differences import (
-    GATE,
-    case,
-    weigh,
-)
+from tests.differences import GATE, case, weigh
 from tests.precision import in_float64
 from tests.scenes import motion, pair
 
