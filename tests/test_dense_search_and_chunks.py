@@ -75,7 +75,6 @@ def test_channels_that_are_not_there_add_what_they_would_on_average(lacking):
         np.hstack([source, channels[0]]), np.hstack([target, channels[1]]), ~masks[0], ~masks[1], penalty, 3
     )
     np.testing.assert_array_equal(query(DenseSearch(), *clouds, 3).T, expected)
-    np.testing.assert_array_equal(query(KDTreeSearch(), *clouds, 3).T, expected)
 
 
 def test_padding_and_what_is_not_finite_match_nothing():
