@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
+from tests.scenes import CORRIDOR, Side, rects
 
-Side = tuple[Sequence[float], Sequence[float], Sequence[float]]
 # Metres: standard deviation of points, and the true motion along x.
 NOISE, STEP = 0.01, 0.3
 
@@ -24,15 +24,6 @@ class Pair(NamedTuple):
     source: mcg.PointCloud
     target: mcg.PointCloud
     T_target_source: np.ndarray
-
-
-def rects(rng: np.random.Generator, count: int, sides: Sequence[Side]) -> np.ndarray:
-    """Points (count, 3) spread evenly over rectangles, each given by a corner and two edges."""
-    corners, first, second = (np.array(part, float) for part in zip(*sides, strict=True))
-    areas = np.linalg.norm(np.cross(first, second), axis=1)
-    rows = rng.choice(len(areas), count, p=areas / areas.sum())
-    along, across = rng.random((2, count, 1))
-    return corners[rows] + along * first[rows] + across * second[rows]
 
 
 def box(low: Sequence[float], high: Sequence[float], lid: bool = True) -> list[Side]:
@@ -75,10 +66,6 @@ def office(seed: int, count: int = 4000, common: float = 0.8) -> Pair:
 
 
 FLOOR_AND_WALL: list[Side] = [((-10, -3, 0), (20, 0, 0), (0, 6, 0)), ((-10, 3, 0), (20, 0, 0), (0, 0, 3))]
-CORRIDOR: list[Side] = [
-    *(((-10, -1, z), (20, 0, 0), (0, 2, 0)) for z in (0, 2.5)),
-    *(((-10, y, 0), (20, 0, 0), (0, 0, 2.5)) for y in (-1, 1)),
-]
 ROAD: list[Side] = [((-20, -6, 0), (40, 0, 0), (0, 12, 0))]
 SCENES = {"floor and wall": FLOOR_AND_WALL, "corridor": CORRIDOR, "road": ROAD}
 # Metres: height of the sensor above the floor, and its maximum range.

@@ -1,6 +1,6 @@
 """Small synthetic clouds with known motion, shared by the tests; of few sizes, since every size compiles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,6 @@ import numpy as np
 import mcgicp_jax as mcg
 from mcgicp_jax._methods.surfaces import searchable, surface_pair, surface_table
 from mcgicp_jax._pose_solver.matched import Matches, Motion, match_surfaces
-from mcgicp_jax._pose_solver.sums import sums_of
 from tests.reference import pose
 
 
@@ -40,12 +39,17 @@ def wall(size: int, noise: float = 0.002, seed: int = 0):
     return points, paint + 0.01 * rng.normal(size=paint.shape)
 
 
-def pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, **settings):
-    """Preprocessed source and target, sampled independently, and the true T_target_source."""
+def raw_pair(scene=room_corner, size: int = 2000, truth: np.ndarray | None = None, seed: int = 1, **settings):
+    """Source and target, sampled independently, and the true T_target_source."""
     truth = motion() if truth is None else truth
-    points, channels = scene(size, seed=1, **settings)
+    points, channels = scene(size, seed=seed, **settings)
     source = mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels)
-    target = mcg.PointCloud(*scene(size, seed=2, **settings))
+    return source, mcg.PointCloud(*scene(size, seed=seed + 1, **settings)), truth
+
+
+def pair(*arguments, **settings):
+    """Those of `raw_pair`, preprocessed."""
+    source, target, truth = raw_pair(*arguments, **settings)
     return mcg.preprocess(source), mcg.preprocess(target), truth
 
 
@@ -68,32 +72,37 @@ def matched_at(source, target, method, pose, matches, robust=None, temperature=N
     return matched, both, Motion(pose[:3, :3], pose[:3, 3])
 
 
-def sums_at(pose, matched, both):
-    """The sums that update a pose, (4, 4), from `matched_at`."""
-    return sums_of(Motion(pose[:3, :3], pose[:3, 3]), matched, both.terms, 0.0, np.bool_(True))
+Side = tuple[Sequence[float], Sequence[float], Sequence[float]]
+"""A rectangle, by a corner and two edges."""
 
 
-def rectangles(*sides: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]) -> Callable[..., np.ndarray]:
-    """A function that samples rectangles evenly, with noise in units of the spacing; each by a corner and two edges."""
+def rects(rng: np.random.Generator, count: int, sides: Sequence[Side]) -> np.ndarray:
+    """Points (count, 3) spread evenly over rectangles."""
+    corners, first, second = (np.array(part, float) for part in zip(*sides, strict=True))
+    areas = np.linalg.norm(np.cross(first, second), axis=1)
+    rows = rng.choice(len(areas), count, p=areas / areas.sum())
+    along, across = rng.random((2, count, 1))
+    return corners[rows] + along * first[rows] + across * second[rows]
+
+
+def rectangles(*sides: Side) -> Callable[..., np.ndarray]:
+    """A function that samples rectangles evenly, with noise in units of the spacing."""
 
     def sample(rng: np.random.Generator, count: int, noise: float) -> np.ndarray:
-        corners, first, second = (np.array(part) for part in zip(*sides, strict=True))
-        areas = np.linalg.norm(np.cross(first, second), axis=1)
-        rows = rng.choice(len(areas), count, p=areas / areas.sum())
-        along, across = rng.random((2, count, 1))
-        points = corners[rows] + along * first[rows] + across * second[rows]
-        return points + noise * np.sqrt(areas.sum() / count) * rng.normal(size=points.shape)
+        points, area = rects(rng, count, sides), sum(np.linalg.norm(np.cross(*edges)) for _, *edges in sides)
+        return points + noise * np.sqrt(area / count) * rng.normal(size=points.shape)
 
     return sample
 
 
+CORRIDOR: list[Side] = [
+    *(((-10, -1, z), (20, 0, 0), (0, 2, 0)) for z in (0, 2.5)),
+    *(((-10, y, 0), (20, 0, 0), (0, 0, 2.5)) for y in (-1, 1)),
+]
 SURFACES = {
     "plane": rectangles(((-5, -5, 0), (10, 0, 0), (0, 10, 0))),
     "floor and wall": rectangles(((-10, 0, 0), (20, 0, 0), (0, 4, 0)), ((-10, 0, 0), (20, 0, 0), (0, 0, 3))),
-    "corridor": rectangles(
-        *(((-10, -1, z), (20, 0, 0), (0, 2, 0)) for z in (0, 2.5)),
-        *(((-10, y, 0), (20, 0, 0), (0, 0, 2.5)) for y in (-1, 1)),
-    ),
+    "corridor": rectangles(*CORRIDOR),
     "crossing planes": rectangles(((-10, -2, 0), (20, 0, 0), (0, 4, 0)), ((-10, -1, -1.7), (20, 0, 0), (0, 2, 3.4))),
     "room": rectangles(
         ((-3, -2, 0), (6, 0, 0), (0, 4, 0)),

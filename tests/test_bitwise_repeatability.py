@@ -46,13 +46,6 @@ def test_repeated_runs_with_any_number_of_workers_agree(name, expected):
         assert bits(mcg.register(*prepared, METHODS[name], search=search)) == expected[name]
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_batches_of_threads_agree(name, expected):
-    source, target = clouds()
-    for result in mcg.register_batch([source] * 8, [target] * 8, METHODS[name]):
-        assert bits(result) == expected[name]
-
-
 @pytest.mark.slow
 def test_another_process_agrees(expected):
     """On as many cores: what XLA compiles depends on their number. Compiled anew, not loaded from the cache."""

@@ -54,18 +54,6 @@ def test_ties_are_ordered_by_row(seed, high, num_channels, size):
     np.testing.assert_array_equal(found.T, ref.nearest(everything[:40], everything, 7))
 
 
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**31), num_points=st.integers(4, 120), scale=st.sampled_from([1e-3, 1.0, 1e4]))
-def test_neighbors_of_random_points(seed, num_points, scale):
-    points = (scale * np.random.default_rng(seed).normal(size=(num_points, 3))).astype(np.float32)
-    found = [search.neighbors(points, 20) for search in (DenseSearch(), KDTreeSearch())]
-    # Rounding decides which of two points at nearly the same distance is the nearer one.
-    ours, others = (np.linalg.norm(points[rows] - points[:, None], axis=2) * (rows >= 0) for rows in found)
-    np.testing.assert_array_equal(found[0] >= 0, found[1] >= 0)
-    np.testing.assert_allclose(ours, others, rtol=1e-5)
-    assert np.mean(found[0] == found[1]) > 0.99
-
-
 def test_neighbors_far_from_the_origin_lose_nothing():
     """As a product of matrices the distances would be nothing but rounding here."""
     points = np.random.default_rng(0).random((300, 3)).astype(np.float32) + np.float32(3000)
@@ -87,7 +75,6 @@ def test_channels_that_are_not_there_add_what_they_would_on_average(lacking):
         np.hstack([source, channels[0]]), np.hstack([target, channels[1]]), ~masks[0], ~masks[1], penalty, 3
     )
     np.testing.assert_array_equal(query(DenseSearch(), *clouds, 3).T, expected)
-    np.testing.assert_array_equal(query(KDTreeSearch(), *clouds, 3).T, expected)
 
 
 def test_padding_and_what_is_not_finite_match_nothing():
@@ -122,17 +109,6 @@ def test_no_table_of_pairs_is_stored(num_candidates, lanes):
 def clouds(raw):
     """With fewer neighbours than raw clouds get, which shows where given ones are lost."""
     return [[mcg.preprocess(pair[side], None, num_neighbors=15) for pair in raw] for side in (0, 1)]
-
-
-def test_matches_are_those_of_the_tree(clouds):
-    source, target = clouds[0][0], clouds[1][0]
-    for method in (mcg.PointToPoint(), mcg.ColorICP(0.3)):
-        found = [
-            mcg.find_correspondences(source, target, T, method, max_distance=0.4, search=search)
-            for search in (KDTreeSearch(), DenseSearch())
-        ]
-        np.testing.assert_array_equal(found[0].valid, found[1].valid)
-        np.testing.assert_array_equal(found[0].indices[found[0].valid], found[1].indices[found[1].valid])
 
 
 def test_preprocess_and_register_agree_with_the_tree(raw):
@@ -257,20 +233,6 @@ def test_pairs_of_shapes_that_the_method_refuses(raw):
     with pytest.warns(mcg.PairWarning, match="pair [01]: channel_weights: "):
         results = mcg.register_batch(*sides, method, max_distance=0.5, search=DenseSearch())
     assert [result.status for result in results] == [Status.INVALID_INPUT] * 2
-
-
-@pytest.mark.slow
-def test_a_bad_pair_spoils_no_other(clouds):
-    expected = in_chunks(*clouds)
-    sources, targets = (list(side) for side in clouds)
-    sources[0], targets[4] = np.array(5.0), np.full((9, 3), np.nan)
-    starts = [None, motion((100.0, 0, 0, 0, 0, 0)), None, None, None, None]
-    with pytest.warns(UserWarning, match="pair [04]"):
-        results = in_chunks(sources, targets, init=starts)
-    assert [result.status for result in results[:2]] == [Status.INVALID_INPUT, Status.TOO_FEW_CORRESPONDENCES]
-    assert results[4].status is Status.INVALID_INPUT
-    for i in (2, 3, 5):
-        assert_same(results[i : i + 1], expected[i : i + 1])
 
 
 @pytest.mark.slow

@@ -341,13 +341,6 @@ def test_ply_with_comments_of_any_kind(tmp_path, text):
             same(io.read(tmp_path / "c.ply"), io.read(tmp_path / "plain.ply"))
 
 
-def test_real_pair_is_the_same_in_both_formats(data):
-    for ply, pcd, num_points in [("source", "251371071", 69792), ("target", "251370668", 69088)]:
-        a, b = (io.read(data / "lidar_pair" / name) for name in (f"{ply}.ply", f"{pcd}.pcd"))
-        assert len(a) == num_points and a.channel_names == INTENSITY and a.points.dtype == np.float32
-        same(a, b)
-
-
 # LAS
 
 

@@ -17,7 +17,6 @@ from mcgicp_jax.__main__ import main
 from mcgicp_jax._global_pose import features
 from mcgicp_jax._global_pose.global_pose import Candidate
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches, _support, fit_pose, hypotheses
-from mcgicp_jax._local_geometry.surface_agreement import surface_agreement
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
 from tests.promise_scenes import NOISE, office, rects
@@ -288,28 +287,6 @@ def test_many_matches_do_not_suffice_where_surfaces_differ():
     assert not result.success and not result.ambiguous and result.support < 1
     # Their number turns on rounding: 54 on one processor.
     assert result.num_inliers > 30
-
-
-def test_agreement_of_surfaces_weighs_all_directions():
-    """A floor coincides with itself wherever it is moved within its plane; a wall on it, with 8 % of the points,
-    does not.
-    """
-    rng = np.random.default_rng(0)
-    floor = rng.uniform(-1, 1, (15_000, 3)) * (3, 3, 0)
-    upright = rng.uniform((0, -3, 0.1), (0, 3, 1.5), (1300, 3))
-    moved = np.eye(4)
-    moved[0, 3] = 0.1
-
-    def agreement(matrix, points):
-        points = points + 0.005 * np.random.default_rng(1).normal(size=points.shape)
-        return surface_agreement(matrix, *(mcg.preprocess(points[i::2]) for i in (0, 1)), 0.2)
-
-    both = np.concatenate([floor, upright])
-    misfit, same = agreement(np.eye(4), both)
-    assert 0.5 < misfit < 3 and same > 0.8
-    assert agreement(moved, both)[0] > 3 * misfit and agreement(moved, floor)[0] < 3
-    moved[2, 3] = 9
-    assert agreement(moved, floor) == (np.inf, 0)
 
 
 def box(size, seed, count=9000):

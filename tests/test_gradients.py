@@ -179,18 +179,6 @@ def test_gradient_by_every_input_agrees_with_central_differences(name, way):
         assert np.abs(gradient["method"].channel_weights).min() > 1e-4 and gradient["temperature"] != 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in CASES if "missing" in name])
-def test_what_stands_where_a_channel_is_missing_has_gradient_0(name):
-    problem = problem_of(name)
-    valid = {f"{side} channels": np.asarray(cloud.channel_valid) for side, cloud in sides(problem.clouds)}
-    unseen = {key: jnp.where(valid[key], problem.inputs[key], jnp.nan) for key in valid}
-    gradient = problem.compiled(problem.inputs | unseen)
-    for key in valid:
-        assert np.isfinite(gradient[key]).all()
-        np.testing.assert_array_equal(gradient[key][~valid[key]], 0)
-
-
 def sides(clouds):
     return zip(("source", "target"), clouds, strict=True)
 
@@ -204,14 +192,8 @@ def in_first_lane(inputs, source, target, start):
     return lane(gradients_in_lanes(inputs, source, target, np.stack([start] * 3)), 0)
 
 
-def test_inside_jit_no_matches_give_no_gradient_and_identical_clouds_a_finite_one(padded):
-    source, target = padded
-    inputs = inputs_of(source, target, *case("mc-gicp"))
-    far = inputs | {"source points": inputs["source points"] + 100}
-    gradient, result = in_first_lane(far, source, target, motion())
-    assert result.status is Status.TOO_FEW_CORRESPONDENCES
-    for leaf in jax.tree.leaves(gradient):
-        np.testing.assert_array_equal(leaf, 0)
+def test_inside_jit_identical_clouds_have_a_finite_gradient(padded):
+    source, _ = padded
     gradient, result = in_first_lane(inputs_of(source, source, *case("mc-gicp")), source, source, np.eye(4))
     assert np.isfinite(gradient["source points"]).all()
     np.testing.assert_allclose(result.matrix, np.eye(4), atol=1e-5)

@@ -180,26 +180,6 @@ def test_gradient_of_soft_matches_is_that_within_the_constrained_directions():
 
 
 @in_float64
-def test_pose_follows_the_cloud_along_constrained_directions():
-    """Differences of the registration itself: where all matched points move as one, the directions do, too."""
-    clouds, method = clouds_of(plane), mcg.GICP()
-    result = registered(clouds, method)
-    directions, points = result.directions, np.asarray(clouds[0].points)
-
-    def pose(step, twist):
-        turn = jaxlie.SE3.exp(step * twist)
-        moved = clouds[0].replace(points=points @ turn.rotation().as_matrix().T + turn.translation())
-        return registered((moved, clouds[1]), method, init=result.matrix).matrix
-
-    for twist in directions.twists[directions.constrained]:
-        _, slope = jax.jvp(lambda step, twist=twist: pose(step, twist), (0.0,), (1.0,))
-        difference = (pose(1e-5, twist) - pose(-1e-5, twist)) / 2e-5
-        np.testing.assert_allclose(slope, difference, atol=1e-6 * np.abs(difference).max())
-        expected = result.matrix @ (exponential(-1e-5 * twist) - exponential(1e-5 * twist)) / 2e-5
-        np.testing.assert_allclose(slope, expected, atol=1e-6 * np.abs(expected).max())
-
-
-@in_float64
 def test_gradient_after_max_iterations_is_that_of_the_nearby_root():
     clouds, method = clouds_of(plane), mcg.GICP()
     start = registered(clouds, method).matrix

@@ -1,7 +1,5 @@
 """UTM coordinates, 5,000 km from zero, lose nothing: not in float32, not in batches, files and commands."""
 
-import csv
-
 import jax
 import numpy as np
 import pytest
@@ -136,14 +134,3 @@ def test_compare_measures_at_the_cloud(files, capsys):
     start = 1e3 * pose_error(np.eye(4), TRUTH, at=middle)[0]
     assert float(far["(start)"][0]) == pytest.approx(start, abs=0.02)
     assert float(far["mc-gicp"][0]) < 5 and float(far["gicp"][0]) < 5
-
-
-@pytest.mark.parametrize("files", [".las"], indirect=True)
-def test_the_batch_command(files, near):
-    folder, _ = files
-    (folder / "pairs.csv").write_text("source,target\nsource.las,target.las\n")
-    assert main(["batch", str(folder / "pairs.csv"), "--output", str(folder / "out.csv"), *OPTIONS]) == 0
-    with open(folder / "out.csv", newline="", encoding="utf-8") as file:
-        (row,) = csv.DictReader(file)
-    matrix = np.reshape([float(row[f"m{i}{j}"]) for i in range(3) for j in range(4)], (3, 4))
-    assert_as_near(matrix, near)

@@ -10,10 +10,11 @@ from mcgicp_jax import io
 from mcgicp_jax.__main__ import main
 from mcgicp_jax._math.statistics import spread_rows
 from tests.compilations import compilations
-from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, inputs_of, weigh
+from tests.differences import GATE, TO_ROUNDING, check_eager_gradient, clouds_with, inputs_of, weigh
 from tests.precision import in_float64
+from tests.reference import logarithm
 from tests.refusals import refused
-from tests.scenes import covariances, motion, pair, room_corner
+from tests.scenes import covariances, pair
 
 pytestmark = in_float64
 
@@ -130,11 +131,9 @@ def test_gradients_agree_with_differences(clouds, method):
     start = mcg.register(source, target, method, **options)
 
     def loss(inputs):
-        moved = (
-            cloud.replace(points=inputs[f"{name} points"], channels=inputs[f"{name} channels"])
-            for name, cloud in (("source", source), ("target", target))
+        return weigh(
+            mcg.register(*clouds_with(inputs, source, target), inputs["method"], init=start.matrix, **options).matrix
         )
-        return weigh(mcg.register(*moved, inputs["method"], init=start.matrix, **options).matrix)
 
     inputs = inputs_of(source, target, method, None)
     gradient = check_eager_gradient(loss, inputs)
@@ -213,15 +212,8 @@ def test_the_covariance_is_calibrated():
     standard error of 0.55. As for all points, a factor of two either way is the design effect's own error."""
     squares = []
     for seed in range(40):
-        truth = motion()
-        points, channels = room_corner(3000, seed=2 * seed + 10)
-        source = mcg.preprocess(mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels))
-        target = mcg.preprocess(mcg.PointCloud(*room_corner(3000, seed=2 * seed + 11)))
+        source, target, truth = pair(size=3000, seed=2 * seed + 10)
         result = mcg.register(source, target, mcg.MultiChannelGICP(), max_source_points=1000)
-        error = np.linalg.inv(truth) @ result.matrix
-        twist = np.array(
-            [*error[:3, 3], error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]]
-        )
-        twist[3:] /= 2
+        twist = logarithm(np.linalg.inv(truth) @ result.matrix)
         squares.append(twist @ np.linalg.solve(np.asarray(result.covariance), twist))
     assert 3 < np.mean(squares) < 12

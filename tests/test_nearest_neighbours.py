@@ -207,37 +207,6 @@ def test_correspondences_against_the_reference(weights, max_distance):
     np.testing.assert_allclose(np.asarray(found.distances)[:150][valid], distances, atol=tolerance(1e-6, 1e-12))
 
 
-@pytest.mark.parametrize(
-    ("source", "target", "colours", "weight", "indices", "valid"),
-    [
-        pytest.param(
-            [[0.0, 0, 0], [0, 9, 9.6], [5, 5, 5], [9, 9, 0.0]],
-            [[0.1, 0, 0], [0, 9, 9], [9, 0, 9], [9, 9, 0.0]],
-            ([100.0, 3, 4, 5], [0.0, 3, 4, 5]),
-            1e-3,
-            None,
-            [True, False, False, True],
-            id="another colour 0.1 m away is a match, the same colour 0.6 m away is not",
-        ),
-        pytest.param(
-            FAR := [[0.0, 0, 0], [2, 0, 0], [9, 9, 9], [9, 9, 0]],
-            FAR,
-            ([1.0, 1, 7, 8], [0.0, 1, 7, 8]),
-            100.0,
-            [1, 1, 2, 3],
-            [False, True, True, True],
-            id="a match beyond the gate is not replaced by a nearer one",
-        ),
-    ],
-)
-def test_the_gate_is_in_metres_and_follows_the_search(source, target, colours, weight, indices, valid):
-    pair = [preprocess(PointCloud(*arrays), num_neighbors=3) for arrays in zip((source, target), colours, strict=True)]
-    found = find_correspondences(*pair, np.eye(4), ColorICP(weight), max_distance=0.5)
-    np.testing.assert_array_equal(found.valid[:4], valid)
-    if indices:
-        np.testing.assert_array_equal(found.indices[:4], indices)
-
-
 def test_padding_is_never_matched():
     """Here, padding of the target lies at the origin, right on top of the source."""
     points, channels = ref.scene(140, 3)

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
-from mcgicp_jax._local_geometry.observability import agreement
 from mcgicp_jax._pose_solver import covariance
 from mcgicp_jax._pose_solver.covariance import Moments, NoiseSample, discounts_and_radius, response_and_scatter
 from mcgicp_jax._pose_solver.degeneracy import LEAST_BY_GEOMETRY, find_directions
@@ -22,7 +21,7 @@ from tests.batches import raw_pair
 from tests.benchmarks.noise_scenes import street
 from tests.corridor import corridor
 from tests.precision import in_float64
-from tests.reference import pose, symmetric
+from tests.reference import logarithm, pose, symmetric
 from tests.refusals import refused
 from tests.scenes import SURFACES, motion, pair, prepare, wall
 
@@ -58,19 +57,13 @@ def test_random_points_are_registered(size):
     assert result.converged and np.abs(result.matrix - truth).max() < 1e-4
 
 
-def test_padding_does_not_change_evidence():
-    """Clouds of fewer than 1,000 points have another estimate of the noise."""
-    cloud = mcg.preprocess(SURFACES["room"](np.random.default_rng(0), 900, 0.5))
-    observed, padded = (prepare(mcg.GICP(), each, observed=True).observability for each in (cloud, cloud.pad(1024)))
-    np.testing.assert_array_equal(padded[:900], observed)
-
-
 @pytest.mark.parametrize("method", [mcg.GICP(), mcg.MultiChannelGICP(photometric=True)])
 def test_padding_changes_no_pose_and_no_deviation(method):
-    """Of points so sparse that each has its own cell, by whose number those cells are chosen that share a sum."""
+    """Of points so sparse that each has its own cell, by whose number those cells are chosen that share a sum; and of
+    fewer than 1,000 points, whose noise is estimated otherwise."""
     clouds = [mcg.preprocess(cloud, 0.3) for cloud in raw_pair(300, 2)[:2]]
     result, padded = (
-        mcg.register(*each, method, max_distance=0.5) for each in (clouds, [cloud.pad(700) for cloud in clouds])
+        mcg.register(*each, method, max_distance=0.5) for each in (clouds, [cloud.pad(1100) for cloud in clouds])
     )
     np.testing.assert_allclose(padded.matrix, result.matrix, atol=1e-6)
     np.testing.assert_allclose(padded.deviations, result.deviations, rtol=1e-4)
@@ -122,45 +115,6 @@ def test_noise_of_channels_is_not_observed():
     _, channels = mean_evidence(cloud, mcg.MultiChannelGICP().resolve(cloud, cloud))
     # What is taken off is a little more than the noise leaves behind: below zero, nothing is constrained either.
     assert np.linalg.eigvalsh(channels).min() > -0.05 and np.linalg.eigvalsh(channels).max() < 5e-3
-
-
-def test_slopes_that_agree_are_observed_and_unrelated_ones_are_not():
-    rng = np.random.default_rng(0)
-    ours, theirs = rng.normal(size=(2, 2, 3, 4000)).astype(np.float32)
-    length = np.sum(ours**2, axis=(0, 1))
-    expected = np.einsum("cin,cjn->nij", ours, ours) / (1 + length)[:, None, None]
-    observed, _ = jax.jit(agreement)(jnp.asarray(ours), jnp.asarray(ours), jnp.zeros((3, 4000)))
-    np.testing.assert_allclose(symmetric(observed), expected, atol=1e-5)
-    observed, _ = jax.jit(agreement)(jnp.asarray(ours), jnp.asarray(theirs), jnp.zeros((3, 4000)))
-    np.testing.assert_allclose(symmetric(observed).mean(axis=0), 0, atol=0.02)
-
-
-@pytest.mark.parametrize("kind, least, most", [("all", 0.2, 0.3), ("x", -1 / 64, 1), ("radial", -1, -0.1)])
-def test_gradients_along_the_lines_of_sight_alone_lack_others(kind, least, most):
-    """Surplus over agreement along x, on a disc below the sensor: negative for a pattern of ranges alone."""
-    rng = np.random.default_rng(0)
-    around, angle = rng.uniform(0, 2 * np.pi, (2, 20_000))
-    angle = {"all": angle, "x": 0 * angle, "radial": around}[kind]
-    zero = np.zeros_like(around)
-    gradients = jnp.asarray([[np.cos(angle), np.sin(angle), zero]])
-    observed = jax.jit(agreement)(gradients, gradients, jnp.asarray([-np.sin(around), np.cos(around), zero]))
-    agreed, surplus = (symmetric(each).mean(axis=0)[0, 0] for each in observed)
-    assert least <= surplus / agreed <= most
-
-
-@pytest.mark.parametrize("moves, status", [(True, mcg.Status.DEGENERATE), (False, mcg.Status.CONVERGED)])
-def test_a_pattern_that_moves_with_the_sensor_constrains_nothing(moves, status):
-    """A road with lanes and with intensities that depend on range, from a sensor that drives: the clouds agree at no
-    motion. A sensor at rest that sees a texture has clouds that agree there, too."""
-    rng = np.random.default_rng(0)
-    clouds = []
-    for _ in range(2):
-        points = np.column_stack([rng.uniform(-8, 8, 8000), rng.uniform(-4, 4, 8000), 0.01 * rng.normal(size=8000) - 2])
-        x, y, _ = points.T
-        pattern = 0.3 * np.sin(3 * y) + np.sin(4 * np.hypot(x, y) if moves else 3 * x + np.cos(2 * y))
-        clouds.append(mcg.PointCloud(points, pattern + 0.05 * rng.normal(size=8000)))
-    ahead = motion((0.1, 0, 0, 0, 0, 0))
-    assert mcg.register(*clouds, mcg.MultiChannelGICP(), init=ahead).status == status
 
 
 @pytest.mark.slow
@@ -439,10 +393,6 @@ def test_deviations_are_huge_along_unconstrained_directions(flat):
         # A motion of one metre, of ten times the radius
         scaled = direction.twist / (direction.twist @ direction.twist)
         assert scaled @ np.asarray(result.covariance) @ scaled > 1
-    constrained = np.asarray(result.directions.constrained)
-    coefficients = np.linalg.inv(np.asarray(result.directions.twists, np.float64).T)[constrained]
-    assert len(coefficients) == 3
-    assert np.sqrt(np.diagonal(coefficients @ result.covariance @ coefficients.T)).max() < 5e-3
 
 
 def test_large_coordinates_keep_the_covariance_of_the_points():
@@ -546,9 +496,7 @@ def test_normalised_squared_errors_are_one_on_average(method):
             for name, frame in (("source", source), ("target", target))
         ]
         result = mcg.register(*clouds, method, init=truth, max_distance=0.5)
-        left = np.linalg.inv(truth) @ result.matrix
-        error = np.append(left[:3, 3], [left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]])
-        error[3:] *= 0.5
+        error = logarithm(np.linalg.inv(truth) @ result.matrix)
         squares.append(error @ np.linalg.solve(np.asarray(result.covariance, np.float64), error) / 6)
     assert 0.5 < np.mean(squares) < 1.9
 

@@ -14,16 +14,25 @@ from tests.refusals import refused
 from tests.scenes import motion
 
 
+def changed(graph, motions=None, information=None):
+    """The graph with other measurements."""
+    edges = graph.edges
+    motions = edges.T_i_j if motions is None else motions
+    information = edges.information if information is None else information
+    return mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, edges.j, motions, information), graph.factors)
+
+
+def se3s_of(twists):
+    return jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(jnp.asarray(twists))
+
+
 @jax.jit
 def differentiated(graph, twists, change):
     """The result of a compiled program, and its derivative as motions move by twists and information changes."""
 
     def at(step):
-        edges = graph.edges
-        motions = edges.T_i_j @ jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(step * twists)
-        information = edges.information + step * change
-        moving = mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, edges.j, motions, information))
-        found = mcg.optimize_poses(moving, robust=False)
+        motions, information = graph.edges.T_i_j @ se3s_of(step * twists), graph.edges.information + step * change
+        found = mcg.optimize_poses(changed(graph, motions, information), robust=False)
         return found.poses, found
 
     _, slope, found = jax.jvp(at, (0.0,), (1.0,), has_aux=True)
@@ -56,7 +65,7 @@ def test_rounding_does_not_decide_the_status_inside_transformations():
 @in_float64
 def test_transformations_give_the_same_poses_and_derivatives(both):
     graph, expected, found, slope = both
-    check_slope(graph, slope)
+    check_slope(graph, slope, *direction(graph))
     assert found.converged and found.status == mcg.Status.CONVERGED
     np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-4)
     np.testing.assert_allclose(found.poses, expected.poses, atol=2e-3)
@@ -78,7 +87,7 @@ def test_priors_give_the_same_inside_transformations(both):
     assert found.converged and expected.converged
     np.testing.assert_allclose(found.poses, expected.poses, atol=2e-3)
     np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-3 * expected.covariance.max())
-    check_slope(graph, slope)
+    check_slope(graph, slope, *direction(graph))
 
 
 def test_a_rejected_edge_has_no_gradient():
@@ -94,29 +103,22 @@ def test_a_rejected_edge_has_no_gradient():
     assert np.any(gradient[:3]) and not np.any(gradient[3])
 
 
-def check_slope(graph, slope):
-    twists, change = direction(graph)
-    edges, h = graph.edges, 0.02
-
+def check_slope(graph, slope, twists, change=0.0, h=0.02, share=0.005):
     def poses(step):
-        motions = edges.T_i_j @ np.asarray(se3s_of(step * twists))
-        moving = mcg.Edge(edges.i, edges.j, motions, edges.information + step * change)
-        return mcg.optimize_poses(mcg.PoseGraph(graph.poses, moving), robust=False).poses
+        # Rotation vectors equal twists to first order.
+        motions, information = moved(graph.edges.T_i_j, step * twists), graph.edges.information + step * change
+        return mcg.optimize_poses(changed(graph, motions, information), robust=False).poses
 
     expected = (poses(h) - poses(-h)) / (2 * h)
-    np.testing.assert_allclose(slope, expected, atol=0.005 * np.abs(expected).max())
-
-
-def se3s_of(twists):
-    return jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(jnp.asarray(twists))
+    np.testing.assert_allclose(slope, expected, atol=share * np.abs(expected).max())
 
 
 def test_failures_inside_transformations_are_statuses(both):
     graph = both[0]
     edges, last = graph.edges, len(graph.poses) - 1
     others = (edges.i != last) & (edges.j != last)
-    cut = mcg.Edge(edges.i, edges.j, edges.T_i_j, others[:, None, None] * edges.information)
-    found, _ = differentiated(mcg.PoseGraph(graph.poses, cut), *direction(graph))
+    cut = changed(graph, information=others[:, None, None] * edges.information)
+    found, _ = differentiated(cut, *direction(graph))
     assert found.status == mcg.Status.DEGENERATE and not found.converged
     twists, change = direction(graph)
     found, slope = differentiated(graph, twists, np.nan * change)
@@ -133,9 +135,8 @@ def circle(seed, number=20, step=30.0):
 
 
 def weighted_sum(step, graph, twists, scale):
-    edges = graph.edges
-    moving = mcg.Edge(edges.i, edges.j, edges.T_i_j @ se3s_of(step * twists), edges.information)
-    return jnp.sum(scale * mcg.optimize_poses(mcg.PoseGraph(graph.poses, moving), robust=False).poses)
+    moving = changed(graph, graph.edges.T_i_j @ se3s_of(step * twists))
+    return jnp.sum(scale * mcg.optimize_poses(moving, robust=False).poses)
 
 
 compiled_gradient = jax.jit(jax.grad(weighted_sum))
@@ -145,17 +146,9 @@ compiled_gradient = jax.jit(jax.grad(weighted_sum))
 def test_gradients_of_precise_graphs_are_right_in_float32(seed):
     graph, rng = circle(seed), np.random.default_rng(seed)
     twists, scale = 1e-3 * rng.normal(size=(len(graph.edges), 6)), rng.normal(size=(len(graph.poses), 4, 4))
-
-    def poses(step):
-        edges = graph.edges
-        # Rotation vectors equal twists to first order.
-        moving = mcg.Edge(edges.i, edges.j, moved(edges.T_i_j, step * twists), edges.information)
-        return mcg.optimize_poses(mcg.PoseGraph(graph.poses, moving), robust=False).poses
-
-    expected = (poses(0.01) - poses(-0.01)) / 0.02
     found, slope = differentiated(graph, twists, np.zeros((len(graph.edges), 6, 6)))
     assert found.converged and found.num_iterations <= 5
-    np.testing.assert_allclose(slope, expected, atol=1e-3 * np.abs(expected).max())
+    check_slope(graph, slope, twists, h=0.01, share=1e-3)
     gradient = compiled_gradient(0.0, graph, twists, scale)
     assert gradient != 0
     np.testing.assert_allclose(gradient, np.sum(scale * slope), atol=1e-3 * np.sum(np.abs(scale * slope)))
@@ -166,8 +159,7 @@ def test_eager_gradients_and_batches_are_those_of_compiled_programs():
     edges = graph.edges
 
     def loss(information):
-        moving = mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, edges.j, edges.T_i_j, information))
-        return jnp.sum(mcg.optimize_poses(moving).poses[-1, :3, 3])
+        return jnp.sum(mcg.optimize_poses(changed(graph, information=information)).poses[-1, :3, 3])
 
     information = jnp.asarray(edges.information) * (1 + jnp.arange(len(edges))[:, None, None] / len(edges))
     expected = jax.jit(jax.grad(loss))(information)
@@ -226,9 +218,8 @@ def test_gradients_reach_motions_and_informations(priors):
     directions = {"motions": rng.normal(size=(m, 6)), "information": 10 * (change + change.swapaxes(1, 2))}
 
     def loss(steps):
-        motions = edges.T_i_j @ jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(steps[0] * directions["motions"])
-        information = edges.information + steps[1] * directions["information"]
-        moving = mcg.PoseGraph(graph.poses, mcg.Edge(edges.i, edges.j, motions, information))
+        motions = edges.T_i_j @ se3s_of(steps[0] * directions["motions"])
+        moving = changed(graph, motions, edges.information + steps[1] * directions["information"])
         return jnp.sum(scale * mcg.optimize_poses(moving, robust=False).poses[:, :3])
 
     value, (forward, gradient) = (

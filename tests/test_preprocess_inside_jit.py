@@ -106,18 +106,6 @@ def test_of_too_many_voxels_no_row_is_valid():
     assert not np.any(jax.jit(partial(averaged, size=100))(*surface()).valid)
 
 
-@pytest.mark.slow
-def test_too_many_voxels_show_in_the_status():
-    points, channels = surface()
-
-    @jax.jit
-    def registered(points):
-        cloud = averaged(points, channels, size=100)
-        return mcg.register(cloud, cloud, mcg.PointToPoint(), max_distance=0.5)
-
-    assert registered(points).status is mcg.Status.TOO_FEW_CORRESPONDENCES
-
-
 @in_float64
 def test_derivatives_of_means():
     points, channels = (array.astype(float) for array in surface(200))

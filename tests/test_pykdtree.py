@@ -1,11 +1,9 @@
 """pykdtree in place of SciPy's tree: the same matches, bit for bit."""
 
-import itertools
 import subprocess
 import sys
 import textwrap
 
-import jax
 import numpy as np
 import pytest
 import scipy.spatial
@@ -14,12 +12,10 @@ from hypothesis import strategies as st
 
 import mcgicp_jax as mcg
 from mcgicp_jax.extend import SearchPoints
-from tests.benchmarks import accuracy
 from tests.refusals import refused
 
 pytest.importorskip("pykdtree")
 SCIPY, PYKDTREE = (mcg.KDTreeSearch(backend=name) for name in ("scipy", "pykdtree"))
-METHODS = (mcg.GICP(), mcg.MultiChannelGICP(), mcg.MultiChannelGICP(photometric=True))
 STILL = np.array([1.0, 0, 0, 0, 0, 0, 0])
 
 
@@ -79,21 +75,3 @@ def test_without_pykdtree_its_extra_is_named():
             raise AssertionError
     """
     subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True, timeout=120)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["lidar pair", *(name for name in accuracy.SETS if "posters" not in name)])
-def test_real_pairs_have_the_same_poses(data, name):
-    if name == "lidar pair":
-        clouds = [mcg.io.read(data / "lidar_pair" / f"{side}.ply") for side in ("source", "target")]
-        pairs, voxel_size, options = [(*clouds, np.eye(4))], 0.25, {}
-    else:
-        make, voxel_size, options = accuracy.SETS[name]
-        pairs = [(pair.source, pair.target, pair.start) for pair in itertools.islice(make(), 2)]
-    for source, target, init in pairs:
-        results = []
-        for search in (SCIPY, PYKDTREE):
-            clouds = [mcg.preprocess(cloud, voxel_size, search=search) for cloud in (source, target)]
-            results += [[mcg.register(*clouds, method, init=init, search=search, **options) for method in METHODS]]
-        for one, other in zip(*map(jax.tree.leaves, results), strict=True):
-            np.testing.assert_array_equal(np.asarray(one), np.asarray(other))

@@ -15,7 +15,7 @@ from mcgicp_jax import Status
 from mcgicp_jax.metrics import pose_error
 from tests.precision import in_both_precisions, tolerance
 from tests.refusals import refused
-from tests.scenes import motion, pair, room_corner, wall
+from tests.scenes import motion, pair, raw_pair, room_corner, wall
 
 METHODS = {
     "point-to-point": mcg.PointToPoint,
@@ -70,18 +70,6 @@ def test_moving_a_cloud_moves_the_pose(name, room):
         assert difference(found, expected) < tolerance(5e-5, 1e-8)
 
 
-def test_four_noisy_starts_reach_one_pose(room):
-    source, target, truth = room
-    rng = np.random.default_rng(0)
-    poses = []
-    for _ in range(4):
-        start = truth @ motion(np.concatenate([rng.normal(scale=0.05, size=3), rng.normal(scale=0.03, size=3)]))
-        result = mcg.register(source, target, METHODS["mc-gicp"](), init=start, max_distance=0.5, **tight())
-        assert difference(start, truth) > 0.01
-        poses.append(result.matrix)
-    assert max(difference(pose, poses[0]) for pose in poses) < 1e-3
-
-
 def test_the_result_belongs_to_the_returned_pose(room):
     source, target, _ = room
     method = METHODS["mc-gicp"]()
@@ -108,27 +96,6 @@ def test_information_is_the_curvature_of_the_cost_with_fixed_M(room):
     np.testing.assert_allclose(result.information, np.einsum("nia,nib->ab", jacobian, jacobian), rtol=1e-4, atol=1e-1)
 
 
-@in_both_precisions
-def test_estimate_pose_returns_a_fixed_point(room):
-    source, target, truth = room
-    method = METHODS["mc-gicp"]()
-    matches = mcg.find_correspondences(source, target, truth, method, max_distance=0.5)
-    options = dict.fromkeys(("translation_tolerance", "rotation_tolerance"), tolerance(1e-6, 1e-11))
-    result = mcg.estimate_pose(source, target, matches, method, **options)
-    again = mcg.estimate_pose(source, target, matches, method, init=result.matrix, max_iterations=1, **options)
-    assert result.converged and again.converged
-    assert difference(result.matrix, again.matrix) < tolerance(2e-6, 1e-10)
-
-
-@pytest.mark.parametrize("name", ["gicp", "mc-gicp"])
-def test_swapped_clouds_give_the_inverse(name, room):
-    source, target, _ = room
-    forward = mcg.register(source, target, METHODS[name](), max_distance=0.5, **tight())
-    backward = mcg.register(target, source, METHODS[name](), max_distance=0.5, **tight())
-    # Each direction has its own matches, so the answers agree to the noise of matching.
-    assert difference(forward.matrix @ backward.matrix, np.eye(4)) < 2e-3
-
-
 def test_identical_clouds_converge_in_one_iteration(room):
     source, _, _ = room
     result = mcg.register(source, source, METHODS["mc-gicp"](), max_distance=0.5)
@@ -138,12 +105,10 @@ def test_identical_clouds_converge_in_one_iteration(room):
 
 @pytest.mark.parametrize("robust", [mcg.Huber, mcg.Tukey])
 def test_robust_kernels_resist_outliers(robust):
-    truth = motion()
-    points, channels = room_corner(2000, seed=1)
-    target = mcg.preprocess(mcg.PointCloud(*room_corner(2000, seed=2)))
+    source, target, truth = raw_pair()
     # A fifth of the source has been lifted, all of it in one direction.
-    points[:400] += [0.0, 0.0, 0.3]
-    source = mcg.preprocess(mcg.PointCloud((points - truth[:3, 3]) @ truth[:3, :3], channels))
+    source.points[:400] += [0.0, 0.0, 0.3] @ truth[:3, :3]
+    source, target = mcg.preprocess(source), mcg.preprocess(target)
     plain = mcg.register(source, target, mcg.GICP(), max_distance=0.5)
     kernel = mcg.register(source, target, mcg.GICP(), max_distance=0.5, robust=robust(1.0))
     assert kernel.converged
@@ -171,15 +136,6 @@ def test_clouds_without_overlap_do_not_converge(room):
     assert np.isnan(result.covariance).all() and result.unconstrained_directions == ()
     np.testing.assert_allclose(result.matrix, motion((50, 0, 0, 0, 0, 0)))
     assert "TOO_FEW_CORRESPONDENCES" in repr(result)
-
-
-def test_a_flat_wall_is_degenerate_for_point_to_plane():
-    points, _ = wall(2000, noise=0.0)
-    source, target = mcg.preprocess(points + np.array([0.1, 0.0, 0.02])), mcg.preprocess(points)
-    result = mcg.register(source, target, mcg.PointToPlane(), max_distance=0.5)
-    assert result.status is Status.DEGENERATE and not result.converged
-    # Constrained directions are found, the others stay where they were.
-    np.testing.assert_allclose(result.matrix[:3, 3], [0, 0, -0.02], atol=1e-4)
 
 
 def test_every_status_but_converged_has_advice():
@@ -470,16 +426,8 @@ def test_a_copied_result_holds_no_clouds():
     assert all(cloud() is None for cloud in clouds) and np.isfinite(result.covariance).all()
 
 
-@pytest.mark.parametrize(
-    "transformation",
-    [
-        lambda function: function,
-        pytest.param(jax.jit, marks=pytest.mark.slow),
-        pytest.param(lambda function: lambda *args: jax.vjp(function, *args, has_aux=True)[2], marks=pytest.mark.slow),
-    ],
-    ids=["outside", "jit", "vjp"],
-)
-def test_a_pose_from_a_small_overlap_is_unverified(transformation):
+@pytest.mark.parametrize("way", ["outside", *(pytest.param(way, marks=pytest.mark.slow) for way in ("jit", "vjp"))])
+def test_a_pose_from_a_small_overlap_is_unverified(way):
     target, near = (room_corner(size, seed=seed)[0] + 40 for size, seed in ((300, 0), (25, 1)))
     source, target = (mcg.preprocess(points, None) for points in (np.concatenate([near, target[:275] - 50]), target))
 
@@ -487,15 +435,11 @@ def test_a_pose_from_a_small_overlap_is_unverified(transformation):
         result = mcg.register(source.replace(points=points), target, mcg.PointToPlane(), max_distance=1.0)
         return result.matrix, result
 
-    warned = (
-        contextlib.nullcontext()
-        if transformation is jax.jit
-        else pytest.warns(UserWarning, match='such as init="global"$')
-    )
-    with warned:
-        result = jax.tree.leaves(transformation(registered)(source.points), is_leaf=lambda leaf: hasattr(leaf, "rmse"))[
-            -1
-        ]
+    with contextlib.nullcontext() if way == "jit" else pytest.warns(UserWarning, match='such as init="global"$'):
+        if way == "vjp":
+            *_, result = jax.vjp(registered, source.points, has_aux=True)
+        else:
+            _, result = (jax.jit(registered) if way == "jit" else registered)(source.points)
     assert result.status == Status.UNVERIFIED and 0 < result.overlap < 0.1 and np.isfinite(result.matrix).all()
     with pytest.warns(UserWarning, match="of the source points have a match, .* pass a better init$"):
         mcg.register(source, target, mcg.PointToPlane(), init=np.eye(4), max_distance=1.0)

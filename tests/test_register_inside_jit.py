@@ -9,14 +9,9 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from tests.differences import (
-    CONVERGED,
-    GATE,
-    case,
-    weigh,
-)
+from tests.differences import GATE, case, weigh
 from tests.precision import in_float64
-from tests.scenes import matched_at, motion, pair, sums_at
+from tests.scenes import motion, pair
 
 
 def test_gradient_by_the_initial_pose_is_0(noisy):
@@ -113,46 +108,6 @@ def test_second_derivatives_of_estimate_pose_are_refused(noisy):
     for outer in (jax.jacfwd, jax.grad):
         with pytest.raises(NotImplementedError):
             jax.make_jaxpr(outer(jax.grad(loss)))(0.1)
-
-
-@pytest.mark.slow
-@in_float64
-def test_implicit_gradient_is_that_of_the_unrolled_loop(noisy):
-    """Differentiating through 60 updates with M renewed each time reaches the same number, at many times the cost."""
-    source, target, _ = noisy
-    method, _ = case("gicp")
-    from mcgicp_jax._math.poses import move_pose, se3_from_matrix
-
-    matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
-
-    def unrolled(points):
-        matched, both, _ = matched_at(source.replace(points=points), target, method, motion(), matches)
-
-        def body(pose, _):
-            sums = sums_at(pose.as_matrix(), matched, both)
-            information, gradient = _normal_equations(sums)
-            twist = jnp.linalg.solve(information, gradient)
-            return move_pose(pose, twist, sums.center), None
-
-        pose, _ = jax.lax.scan(body, se3_from_matrix(motion(), points.dtype), length=60)
-        return weigh(pose.as_matrix())
-
-    def implicit(points):
-        return weigh(
-            mcg.estimate_pose(source.replace(points=points), target, matches, method, init=motion(), **CONVERGED).matrix
-        )
-
-    expected, actual = jax.jit(jax.grad(unrolled))(source.points), jax.jit(jax.grad(implicit))(source.points)
-    np.testing.assert_allclose(actual, expected, atol=1e-8 * np.abs(expected).max())
-
-
-def _normal_equations(sums):
-    """Gauss-Newton's information and right-hand side of a (v, ω) twist, from the sums."""
-    from mcgicp_jax._pose_solver import update as _solve
-
-    tangent = jnp.asarray(_solve._TANGENT, sums.force.dtype)
-    form = _solve._quadratic_form(sums, jnp.ones_like(sums.radius))
-    return tangent.T @ form[:12, :12] @ tangent, -tangent.T @ form[:12, 12]
 
 
 @pytest.mark.slow
