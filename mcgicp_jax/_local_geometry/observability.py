@@ -27,9 +27,10 @@ _NOISE = 0.22
 # Scan lines that bend, as where wall and floor meet, have a plane across a smooth tunnel, which would constrain the
 # pose along it. They are thick (third over second extent) and narrow (second over first), but no lines. Of each pair,
 # at the first value a half may be such a line, at the second it is none. Of 18 tunnels (16 beams, voxels of 0.1 to
-# 0.3 m) 11 were CONVERGED, six of them wrong, with shares up to 0.0044; now two of 52, with up to 0.0024. Rooms,
-# garages, corridors, halls and streets have at least 0.0041. Noise makes neighbourhoods thick that are as wide as long.
-_THICK, _LINE, _NARROW = (0.45, 0.3), (0.25, 0.15), (0.5, 0.7)
+# 0.3 m) 11 were CONVERGED, six of them wrong, with shares up to 0.0044; of 52 now four, two of them wrong, with up to
+# 0.0027. Rooms, garages, corridors, halls and streets have at least 0.0041. Noise makes thick neighbourhoods, too, but
+# they are as wide as long.
+_THICK, _LINE, _NARROW = (0.45, 0.3), (0.25, 0.15), (0.45, 0.65)
 
 
 def geometry_observability(
