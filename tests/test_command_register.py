@@ -146,7 +146,7 @@ def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, capsys):
     drawn.clear()
     # A right pose that so few points do not verify.
     assert main(["register", files["source"], files["target"], "--init", "global", "--plot", "x.png"]) == 1
-    assert "status:    unverified" in capsys.readouterr().out
+    assert "status:    UNVERIFIED" in capsys.readouterr().out
     assert "start" not in drawn
     io.write_poses(tmp_path / "far.txt", [motion((50, 0, 0, 0, 0, 0))])
     assert main(["register", files["source"], files["target"], "--init", str(tmp_path / "far.txt")]) == 1
