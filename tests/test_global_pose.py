@@ -512,8 +512,8 @@ def test_the_command_line_starts_from_anywhere(tmp_path, capsys):
         mcg.io.write(name, cloud)
     assert main(command) == 1
     printed = capsys.readouterr()
-    assert "start:     unsure, " in printed.out and "status:    unverified" in printed.out
-    assert "gicp: unverified: " in printed.err and len(mcg.io.read_poses(names[2])) == 1
+    assert "start:     unsure, " in printed.out and "status:    UNVERIFIED" in printed.out
+    assert "gicp: UNVERIFIED: " in printed.err and len(mcg.io.read_poses(names[2])) == 1
     for name, points in zip(names, np.random.default_rng(0).normal(size=(2, 10, 3)), strict=False):
         mcg.io.write(name, mcg.PointCloud(points))
     assert main(command) == 2
