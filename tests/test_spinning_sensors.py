@@ -13,7 +13,7 @@ def two_scans(rng, solids, height):
     across = np.cos(elevation) * np.stack([np.cos(azimuth), np.sin(azimuth)])
     rays = np.stack([*across, np.sin(elevation)], axis=-1).reshape(-1, 3)
     poses = motion((0.6, 0.1, height, 0.01, -0.01, 0.05)), motion((0, 0, height, 0, 0, 0))
-    hits = [cast(pose, rays, solids, 80) for pose in poses]
+    hits = [cast(pose, rays, solids, 80.0) for pose in poses]
     points = (seen.sensor_rays * (seen.distance + 0.02 * rng.normal(size=len(seen.distance)))[:, None] for seen in hits)
     return *points, np.linalg.inv(poses[1]) @ poses[0]
 

@@ -53,7 +53,7 @@ class DeferredRows:
         rows.setflags(write=False)
         return rows
 
-    def tree_flatten(self) -> tuple[tuple[np.ndarray], None]:
+    def tree_flatten(self) -> tuple[tuple[Any], None]:
         return (self.whole if self._stand_in is None else self._stand_in,), None
 
     @classmethod

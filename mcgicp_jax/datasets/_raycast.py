@@ -81,7 +81,7 @@ def cast(pose: Float[np.ndarray, "4 4"], rays: Rays, solids: Sequence[Solid], ma
     """The nearest hit within `max_range` of each ray, which is in the sensor's frame; ties go to the first solid."""
     rotation, origin = pose[:3, :3], pose[:3, 3]
     rays = rays @ rotation.T
-    distance, normals, solid = np.full(len(rays), float(max_range)), np.zeros_like(rays), np.full(len(rays), -1)
+    distance, normals, solid = np.full(len(rays), max_range), np.zeros_like(rays), np.full(len(rays), -1)
     for number, candidate in enumerate(solids):
         # Only the rays in the cone around its bounding sphere may hit the solid.
         low, high = candidate.bounds
