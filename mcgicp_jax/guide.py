@@ -85,7 +85,7 @@ than 0 count as at least 7e-6 radians (in float64 3e-10), or 7e-6 of the largest
 A variance of 0, or any singular covariance, fixes directions, whatever the clouds say: the initial pose is moved onto
 them, ξ along them stays 0, the covariance is 0 up to rounding, `directions.ties` are infinite, `information` has
 nothing of the prior along them, and the clouds need not constrain them. Inside `jit`, give such a covariance as a NumPy
-array: one of `jnp` is traced there, so that it is not checked, and its variances of 0 are the least ones.
+array. One of `jnp` is traced there: it is not checked, and its variances of 0 count as the least deviations above.
 
 The pose is differentiable by the points of the tie points, the pose of the prior, and covariances other than 0. The
 weights of the matches are constants to autodiff. Where some directions are fixed, the derivative by the pose of the

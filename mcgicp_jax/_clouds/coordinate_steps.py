@@ -1,8 +1,8 @@
 """The step to which coordinates are rounded, whatever wrote them: voxel centres, integers, few digits, float32.
 
 Points on a lattice as coarse as their spacing match the lattice of another cloud rather than its surfaces. A step shows
-in the gaps between the sorted coordinates along an axis, which are multiples of it. Depths of whole disparities show it
-in the gaps between their inverses.
+in the gaps between the sorted coordinates along an axis, which are multiples of it. Depths from whole disparities have
+a step in their inverses.
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]
 def _step_between(values: Float[AnyArray, "3 n"]) -> Float[AnyArray, "3"]:
     """The step of which the gaps between values are multiples; 0 where there is none, NaN where few values repeat."""
     xp = numpy_for(values)
-    known = xp.isfinite(values)
-    largest = xp.max(xp.where(known, xp.abs(values), 0), axis=1, keepdims=True)
+    finite = xp.isfinite(values)
+    largest = xp.max(xp.where(finite, xp.abs(values), 0), axis=1, keepdims=True)
     gaps = xp.diff(xp.sort(values, axis=1), axis=1)
     distinct = gaps > _ROUNDINGS * xp.finfo(gaps.dtype).eps * largest
     number: Any = xp.sum(distinct, axis=1, keepdims=True)
     # Rounded coordinates repeat.
-    repeat = (number > 1) & (2 * number < xp.sum(known, axis=1, keepdims=True))
+    repeat = (number > 1) & (2 * number < xp.sum(finite, axis=1, keepdims=True))
     if xp is np and not repeat.any():
         return np.full(3, np.nan, gaps.dtype)
     ordered = xp.sort(xp.where(distinct, gaps, xp.inf), axis=1)

@@ -227,7 +227,7 @@ def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
 
 def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) -> int | None:
     """The smallest size with few lines, or else the largest at which all clouds show the scene and neighbourhoods are
-    no thicker than they may be: trunks are lines until voxels mix them with the ground. None: there is none."""
+    no thicker than `_THICK`, or than they are at `step`. None: there is none."""
 
     def suffices(cloud: _Averages, larger: int) -> bool:
         return not cloud.shows_scene(larger) or cloud.shape(larger).lines <= _MOST_LINES

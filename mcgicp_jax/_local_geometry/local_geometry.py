@@ -247,9 +247,9 @@ def _slopes_of_products(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, 
 
 
 class SurfaceNoise(NamedTuple):
-    """Values that only the status and the covariance of the final pose need, most of them as in `LocalGeometry`; of the
-    descriptors α · channel, the variance about their linear fits, metres², summed over the channels, and the gradients,
-    None where channels are not used, and for cells."""
+    """Values that only the status and the covariance of the final pose need. `descriptors`: variance of α · channel
+    about its linear fits, metres², summed over the channels. `slopes`: gradients of α · channel; None without channels
+    and for cells. The others are those of `LocalGeometry`."""
 
     descriptors: Float[AnyArray, "*batch N"]
     normal: Float[AnyArray, "*batch N 3"]

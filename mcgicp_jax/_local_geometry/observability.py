@@ -24,12 +24,12 @@ _MARGIN = 0.2
 # κ of `observability_of_halves`: 1/16 makes normals that are nearly right unbiased, 5/16 those of random directions.
 # The value between was measured on corridors, planes and a street, see Constants in `tests/benchmarks/README.md`.
 _NOISE = 0.22
-# Scan lines that bend, as where wall and floor meet, have a plane across a smooth tunnel, which would constrain the
-# pose along it. They are thick (third over second extent) and narrow (second over first), but no lines. Of each pair,
-# at the first value a half may be such a line, at the second it is none. Of 18 tunnels (16 beams, voxels of 0.1 to
-# 0.3 m) 11 were CONVERGED, six of them wrong, with shares up to 0.0044; of 52 now four, two of them wrong, with up to
-# 0.0027. Rooms, garages, corridors, halls and streets have at least 0.0041. Noise makes thick neighbourhoods, too, but
-# they are as wide as long.
+# The neighbourhood of a scan line that bends, as where wall and floor meet, has a plane across a smooth tunnel, which
+# would constrain the pose along it. Such a neighbourhood is thick (third extent over the second) and narrow (second
+# over first), but no line. Each pair is a ramp: a half has the weight 0 at the first value and 1 at the second, and the
+# largest of the three weights counts. Of 18 tunnels (16 beams, voxels of 0.1 to 0.3 m) 11 were CONVERGED, six of them
+# wrong, with shares up to 0.0044; of 52 now four, two of them wrong, with up to 0.0027. Rooms, garages, corridors,
+# halls and streets have at least 0.0041. Noise makes thick neighbourhoods, too, but they are as wide as long.
 _THICK, _LINE, _NARROW = (0.45, 0.3), (0.25, 0.15), (0.45, 0.65)
 
 
@@ -53,19 +53,19 @@ def observability_of_halves(
     With the projectors Pᵢ = nᵢ nᵢᵀ, the noise in (P₁ P₂ + P₂ P₁) / 2 is the square of that in each of them. It is
     estimated by κ sin²φ (P₁ − P₂)², where φ is the angle between the normals, and subtracted. The rest is multiplied by
     the certainties of both normals, which are also independent: the certainty of the normal of all neighbours would be
-    larger where both halves deviate alike. Bent lines count less or not at all (`_THICK`). Where a half is not usable:
-    `geometry_observability` of all neighbours.
+    larger where both halves deviate alike. Halves that may be bent scan lines count less or not at all (`_THICK`).
+    Where a half is not usable: `geometry_observability` of all neighbours.
 
-    Covariances, normals and counts are as there, of all neighbours, of the first and of the second halves (M = 3 N);
-    `usable` says of which halves the normals may be used (L = 2 N).
+    Covariances, normals and counts are as in `geometry_observability`, of all neighbours, of the first and of the
+    second halves (M = 3 N); `usable` says of which halves the normals may be used (L = 2 N).
     """
-    certain, variance, extents = _certainty(covariances, normals, counts)
+    certain, variance, ratios = _certainty(covariances, normals, counts)
     (normal, first, second), size = jnp.split(normals, 3, axis=1), usable.size // 2
     whole = certain[:size] * (alg.outer(normal) - variance[:, :size])
-    thickness, width = extents[:, size:]
-    evidence = ((thickness, _THICK), (width, _LINE), (width, _NARROW))
-    straight = [jnp.clip((ratio - bent) / (none - bent), 0, 1) for ratio, (bent, none) in evidence]
-    certain = certain[size:] * jnp.max(jnp.stack(straight), axis=0)
+    thickness, width = ratios[:, size:]
+    ramps = ((thickness, _THICK), (width, _LINE), (width, _NARROW))
+    weights = [jnp.clip((ratio - zero) / (one - zero), 0, 1) for ratio, (zero, one) in ramps]
+    certain = certain[size:] * jnp.max(jnp.stack(weights), axis=0)
     # In terms of n₁ + n₂ and n₁ − n₂, which are orthogonal; the signs of the normals do not matter.
     cosine = jnp.sum(first * second, axis=0)
     by_sum, by_difference = (

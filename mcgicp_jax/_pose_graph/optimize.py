@@ -36,7 +36,7 @@ class PoseGraphResult:
         residuals: (m,) √(rᵀΛr), the Mahalanobis distance of each edge, in standard deviations.
         weights: (m,) 1 for edges that were kept and 0 for those that were rejected.
         factor_residuals, factor_weights: the same for each element of `PoseGraph.factors`.
-        num_redundant: size of all kept residuals, less six per pose that may move.
+        num_redundant: number of components of all kept residuals, less six per pose that may move.
         uncertainty: deferred value of `covariance`.
     """
 
@@ -59,15 +59,15 @@ class PoseGraphResult:
 
     @property
     def chi_squared(self) -> Any:
-        """χ² of the kept measurements per redundant number: about 1 for independent errors and right information
-        matrices; NaN if no number is redundant.
+        """χ² of the kept measurements, divided by `num_redundant`: about 1 for independent errors and right information
+        matrices; NaN if that is not positive.
 
         Registrations of the same clouds share their noise, which partly cancels around loops: graphs of `odometry` and
         `multiway` have 0.2 to 0.5.
         """
         xp = numpy_for(self.cost, self.num_redundant)
-        some = self.num_redundant > 0
-        return xp.where(some, 2 * self.cost / xp.where(some, self.num_redundant, 1), xp.nan)[()]
+        positive = self.num_redundant > 0
+        return xp.where(positive, 2 * self.cost / xp.where(positive, self.num_redundant, 1), xp.nan)[()]
 
     @property
     def covariance(self) -> Float[Array, "n 6 6"] | Float[np.ndarray, "n 6 6"]:

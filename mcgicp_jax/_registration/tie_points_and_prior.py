@@ -35,9 +35,8 @@ from mcgicp_jax._registration.loop import Problem, State
 # Largest asymmetry of a correlation matrix, as rounding to float32 causes; and smallest eigenvalue with which the
 # inverse of a correlation matrix keeps four digits in float64. Below it, a direction of a prior counts as fixed.
 _ASYMMETRY, _LEAST_EIGENVALUE = 1e-5, 1e-12
-# Rounding of the information of a prior at the least standard deviation σ₀, with lengths in units of the cloud: a
-# standard deviation of 3 %. A variance v becomes v + σ₀² (1 + v/σ₀²)⁻⁸, nearly the larger of the two, and at least
-# 0.42 σ₀².
+# Rounding of the information of a prior at the standard deviation σ₀, with lengths in units of the cloud: a standard
+# deviation of 3 %. A variance v becomes v + σ₀² (1 + v/σ₀²)⁻⁸, nearly the larger of v and σ₀², and at least 0.42 σ₀².
 _LARGEST_ERROR, _SHARPNESS = 1e3, 8
 # Standard deviations of a prior, of the motion of a point, within which the right pose is expected.
 _DEVIATIONS = 3.0
