@@ -231,6 +231,27 @@ def test_the_information_of_a_prior_belongs_to_the_origin_of_the_cloud(corner, a
             np.testing.assert_allclose(error @ information @ error, expected, rtol=1e-4)
 
 
+@pytest.mark.slow
+def test_rounding_of_a_precise_prior_constrains_nothing():
+    """Of a prior that knows x and y to 0.1 mm and nothing else, float32 leaves some information on the yaw."""
+    target, source = mcg.datasets.poster_wall(num_frames=2)
+    clouds = [mcg.preprocess(frame.cloud, 0.03) for frame in (source, target)]
+    truth = (np.linalg.inv(target.pose) @ source.pose).astype(np.float32)
+
+    def register(variances):
+        return mcg.register(*clouds, mcg.GICP(), prior=(truth, variances))
+
+    inside = jax.jit(lambda variances: register(jnp.diag(variances)))
+    for loose in (1e4, 1e12):
+        variances = np.array([1e-8, 1e-8, *4 * [loose]])
+        for result in (register(np.diag(variances)), inside(variances)):
+            assert result.status == mcg.Status.DEGENERATE and result.deviations[5] > 1
+            assert max(mcg.metrics.pose_error(truth, result.matrix)) < 1e-3
+            yaw, *translations = result.unconstrained_directions
+            assert yaw.is_rotation and not yaw.constrained_by_ties
+            assert all(direction.constrained_by_ties for direction in translations)
+
+
 # What geometry leaves free
 
 

@@ -15,7 +15,7 @@ from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm, PoseMeasurements
 from mcgicp_jax._pose_solver.sums import Sums
-from mcgicp_jax._pose_solver.update import Update, twist_form, wrench
+from mcgicp_jax._pose_solver.update import Update, rounding, twist_form, wrench
 
 # In a first registration, the standard deviations of tie points and prior count ten times, and they are at most a
 # thousand times as stiff as the matches. Planar scans whose prior knows roll, pitch and height to 1e-5 then converge
@@ -28,18 +28,21 @@ def constrained_by_pose_form(directions: Directions, information: Float[Array, "
     diagonalise the information (for twists about the centroid with lengths in units of the radius)."""
     basis, fixed = jnp.asarray(directions.twists).T, jnp.asarray(directions.fixed)
     free = ~(jnp.asarray(directions.constrained_by_matches) | fixed)
-    stiffness = jnp.where(jnp.outer(free, free), basis.T @ information @ basis, 0)
+    information = basis.T @ information @ basis
+    stiffness = jnp.where(jnp.outer(free, free), information, 0)
     total = jnp.trace(stiffness)
     scale = jnp.where(total > 0, total, 1)
     # −1 and −2 sort the other directions first.
     values, turn = jnp.linalg.eigh(stiffness / scale + jnp.diag(-1.0 * ~free - fixed))
     squares = turn.T**2
+    # What is no more than the rounding of the most precise directions constrains nothing.
+    ties = jnp.where(values * scale > rounding(jnp.diagonal(information)), values * scale, 0)
     return replace(
         directions,
         twists=(basis @ turn).T,
         geometry=squares @ directions.geometry,
         channels=squares @ directions.channels,
-        ties=jnp.where(values < -1.5, jnp.inf, jnp.where(values < -0.5, 0, values * scale)),
+        ties=jnp.where(values < -1.5, jnp.inf, ties),
     )
 
 
