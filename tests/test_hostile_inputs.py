@@ -155,6 +155,13 @@ def test_squares_of_channels_may_overflow(size):
             assert_believable(outcome(lambda n=name, c=cloud, t=target: mcg.register(c, t, METHODS[n])))
 
 
+def test_distances_may_overflow():
+    points = np.float32(2e38) * np.random.default_rng(0).choice([-1.0, 1.0], (40, 3)).astype(np.float32)
+    source, target = mcg.PointCloud(points), mcg.PointCloud(-points[:1])
+    matches = outcome(lambda: mcg.find_correspondences(source, target, np.eye(4), mcg.GICP(), max_distance=1e38))
+    assert not np.any(matches.valid & np.isinf(matches.distances)) and np.any(np.isinf(matches.distances))
+
+
 @pytest.mark.parametrize("equalize", [False, True])
 def test_differences_of_channels_may_overflow(equalize):
     points = np.random.default_rng(0).uniform(size=(4, 3))

@@ -43,18 +43,24 @@ class Packed(Generic[Tree]):
         xp: Any = np if isinstance(leaves[0], np.ndarray) else jnp
         columns, shapes, others = [], [], []
         for leaf in leaves:
-            columns.append(xp.asarray(leaf, dtype).reshape((*leaf.shape[:num_axes], -1)))
+            column = xp.asarray(leaf, dtype).reshape((*leaf.shape[:num_axes], -1))
+            # XLA joins columns in a fraction of the time if the values of each lie side by side.
+            columns.append(column if xp is np else jnp.moveaxis(column, -1, 0))
             shapes.append(leaf.shape[num_axes:])
             others.append(None if leaf.dtype == dtype else leaf.dtype)
-        return Packed(xp.concatenate(columns, axis=-1), Layout(structure, tuple(shapes), tuple(others)))
+        table = np.concatenate(columns, axis=-1) if xp is np else jnp.moveaxis(jnp.concatenate(columns), 0, -1)
+        return Packed(table, Layout(structure, tuple(shapes), tuple(others)))
 
     @property
     def tree(self) -> Tree:
         """The tree of arrays; views of a NumPy array."""
-        leaves, start, shared = [], 0, self.table.shape[:-1]
+        leaves, start, shared, table = [], 0, self.table.shape[:-1], self.table
+        if not isinstance(table, np.ndarray) and table.ndim > 1:
+            # The same as in `of`: without the barrier, each use of a column would collect it anew.
+            table = jnp.moveaxis(jax.lax.optimization_barrier(jnp.moveaxis(table, -1, 0)), 0, -1)
         for shape, dtype in zip(self.layout.shapes, self.layout.dtypes, strict=True):
             stop = start + math.prod(shape)
-            leaf = self.table[..., start:stop].reshape((*shared, *shape))
+            leaf = table[..., start:stop].reshape((*shared, *shape))
             leaves.append(leaf if dtype is None else leaf.astype(dtype))
             start = stop
         return jax.tree.unflatten(self.layout.structure, leaves)

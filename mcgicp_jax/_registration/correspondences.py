@@ -76,8 +76,8 @@ def find_correspondences(
         nearest = index_of(search, method, target).nearest(np.asarray(start), rows, gate, num_candidates)
         indices = np.maximum(nearest, 0).astype(np.int32)
         matrix = np.asarray(matrix)
-        # By NumPy, so that nothing is compiled.
-        with np.errstate(invalid="ignore"):
+        # By NumPy, so that nothing is compiled. Distances beyond float32 are infinite.
+        with np.errstate(invalid="ignore", over="ignore"):
             moved: Any = rotated(rows.points.astype(np.float64), matrix[:3, :3]) + matrix[:3, 3]
             distances = np.linalg.norm(target_rows.points[indices] - moved, axis=-1).astype(dtype)
             near = distances <= gate
