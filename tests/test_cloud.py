@@ -46,12 +46,10 @@ def leaves(cloud):
 def assert_same(a, b):
     assert a.channel_names == b.channel_names
     for name, value in leaves(a).items():
-        other = getattr(b, name)
-        if value is None:
-            assert other is None
-        else:
-            assert np.asarray(value).dtype == np.asarray(other).dtype
-            np.testing.assert_array_equal(value, other)
+        values, others = jax.tree.leaves(value), jax.tree.leaves(getattr(b, name))
+        for array, other in zip(values, others, strict=True):
+            assert np.asarray(array).dtype == np.asarray(other).dtype
+            np.testing.assert_array_equal(array, other)
 
 
 def test_channels_may_be_a_vector_or_left_out():
@@ -296,10 +294,17 @@ def test_a_cloud_goes_through_jit():
     assert not np.any(through.origin)
     flat, structure = jax.tree.flatten(cloud)
     assert_same(jax.tree.unflatten(structure, flat), cloud)
-    # Of a cloud whose neighbours are still to be found, the lowered function has the same structure.
+
+
+def test_clouds_whose_neighbours_are_still_to_be_found_have_the_structure_of_others():
     fresh = preprocess(raw(), num_neighbors=4)
     compiled = jax.jit(lambda cloud: cloud.neighbors).lower(fresh).compile()
     np.testing.assert_array_equal(compiled(fresh), fresh.neighbors)
+    inside = jax.jit(lambda points: preprocess(PointCloud(points, CHANNELS), None, num_neighbors=4))(POINTS)
+    np.testing.assert_array_equal(inside.neighbors, fresh.neighbors)
+    (moved,), _ = jax.lax.scan(lambda carry, _: ((carry[0].transform(np.eye(4)),), None), (fresh,), length=2)
+    both = jax.tree.map(lambda one, other: one.shape == other.shape, preprocess(raw(), num_neighbors=4), moved)
+    assert all(jax.tree.leaves(both))
 
 
 def test_repr_is_short_and_says_what_matters():

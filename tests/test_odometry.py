@@ -47,6 +47,7 @@ def test_clouds_do_as_well_as_frames_and_preprocessed_ones_are_kept(room):
     again = list(mcg.odometry((frame.cloud for frame in frames[:2]), mcg.GICP(), max_distance=0.5))
     np.testing.assert_array_equal(again[1].pose, steps[1].pose)
     np.testing.assert_allclose(steps[1].pose, steps[1].registration.matrix, atol=1e-7)
+    assert repr(steps[0]) == f"OdometryStep(position (0.000, 0.000, 0.000) m, {clouds[0]!r})"
 
 
 def test_frames_are_read_one_ahead_and_no_further(room):

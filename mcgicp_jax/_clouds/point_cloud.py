@@ -149,8 +149,7 @@ class PointCloud(eqx.Module):
         channel_valid: (N, C), False where the point lacks the channel, as outside a camera's view; the value there is
             0 and is ignored. None: all points have all channels.
         valid: (N,), False for padding.
-        deferred_neighbors: value of the property `neighbors`, of which some rows may not be found yet. All are in
-            `jax.tree.map(np.asarray, cloud)`, which has the structure that the carry of `jax.lax.scan` must keep.
+        deferred_neighbors: holds the property `neighbors`, of which some rows may not be found yet.
         voxels: how the points were averaged, see `voxel_size`.
         covariances: (N, 3, 3), or None. If given, methods use them instead of computing their own: dimensionless for
             GICP and MC-GICP, m² for NDT (from `voxel_gaussians`; the scale of a kernel is then in standard deviations).
@@ -165,7 +164,7 @@ class PointCloud(eqx.Module):
     channels: Float[Array, "*batch N C"] | Float[np.ndarray, "*batch N C"]
     channel_valid: Bool[Array, "*batch N C"] | Bool[np.ndarray, "*batch N C"] | None
     valid: Bool[Array, "*batch N"] | Bool[np.ndarray, "*batch N"]
-    deferred_neighbors: Int[Array, "*batch N k"] | Int[np.ndarray, "*batch N k"] | DeferredRows | None
+    deferred_neighbors: DeferredRows | None
     covariances: Float[Array, "*batch N 3 3"] | Float[np.ndarray, "*batch N 3 3"] | None
     origin: Float[Array, "*batch 3"] | Float[np.ndarray, "*batch 3"]
     voxels: Voxels
@@ -342,8 +341,7 @@ class PointCloud(eqx.Module):
 
         None for raw clouds. `preprocess` leaves the search to the first use of each row; reading this finds the rest.
         """
-        neighbors = self.deferred_neighbors
-        return neighbors.whole if isinstance(neighbors, DeferredRows) else neighbors
+        return None if self.deferred_neighbors is None else self.deferred_neighbors.whole
 
     @property
     def voxel_size(self) -> float | None:
@@ -452,7 +450,8 @@ class PointCloud(eqx.Module):
 
         arrays = {name: grow(getattr(self, name)) for name in ("points", "channels", "covariances", "times")}
         arrays |= {name: grow(getattr(self, name), False) for name in ("channel_valid", "valid")}
-        return self.replace_rows(**arrays, deferred_neighbors=grow(self.neighbors, -1))
+        neighbors = None if self.neighbors is None else DeferredRows.of(grow(self.neighbors, -1))
+        return self.replace_rows(**arrays, deferred_neighbors=neighbors)
 
     def replace_rows(self, **arrays: Any) -> PointCloud:
         """Replace fields without checks; the number of rows may change."""

@@ -165,9 +165,7 @@ def with_neighbors(
     points = (points - origin).astype(dtype)
     # Neighbours are searched among the rounded coordinates, which are those of the registration.
     search = search or default_search()
-    neighbors: Any = search.neighbors_on_demand(points, num_neighbors)
-    if isinstance(neighbors, np.ndarray):
-        neighbors = neighbors.astype(np.int32, copy=False)
+    neighbors = search.neighbors_on_demand(points, num_neighbors)
     arrays = {
         "points": points,
         "channels": np.asarray(cloud.channels, dtype),

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, Voxels
 from mcgicp_jax._clouds.voxels import TURN, VARIATION
-from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.concrete import DeferredRows, is_concrete
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints
 from mcgicp_jax._search.default_search import default_search
@@ -44,7 +44,7 @@ def preprocess_traced(
             raise ValueError("size: expected a number of rows with a voxel_size inside jit and vmap, got None")
         cloud = _averaged(cloud, float(edge), size)
     neighbors = traced_neighbors(cloud, num_neighbors, search or default_search(traced=True))
-    return cloud.replace_rows(deferred_neighbors=neighbors, voxels=Voxels(edge))
+    return cloud.replace_rows(deferred_neighbors=DeferredRows.of(neighbors), voxels=Voxels(edge))
 
 
 def traced_neighbors(cloud: PointCloud, num_neighbors: int, search: AbstractSearch) -> Int[Array, "N k"]:

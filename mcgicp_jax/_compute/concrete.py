@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
+from itertools import chain
+from operator import attrgetter
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -29,55 +31,69 @@ else:
 
 @jax.tree_util.register_pytree_node_class
 class DeferredRows:
-    """A concrete array, such as the neighbours of points, whose rows are computed when they are needed.
+    """An array, such as the neighbours of points, whose rows may be computed when they are needed.
 
-    As a pytree it is the whole array: flattening it computes all rows, as do transformations and copies. `compute` is
-    as of `RowsOnDemand`. `anew` makes the same object for pickles, so that a worker computes it; with None, pickles
-    hold the whole array.
+    As a pytree it is a node with the whole array: flattening it computes all rows, as do transformations, whose results
+    hold nodes with traced or whole arrays. `compute` is as of `RowsOnDemand`. `anew` makes the same object for pickles,
+    so that a worker computes it; with None, pickles hold the whole array.
     """
+
+    _table: RowsOnDemand[np.ndarray] | None
+    _whole: Any = None
 
     def __init__(
         self, compute: Callable[[Any, int | None], np.ndarray], shape: tuple[int, ...], anew: Callable[[], Any] | None
     ):
         self.shape, self._anew = shape, anew
         self._table = RowsOnDemand(compute, shape[0])
-        self._stand_in: Any = None
 
-    def __getitem__(self, rows: Any) -> np.ndarray:
-        return self._table.computed(rows)[rows]
+    @classmethod
+    def of(cls, whole: Any) -> DeferredRows:
+        """Rows that are known: a concrete or traced array, or what stands for one, such as its shape."""
+        rows = object.__new__(cls)
+        rows.shape, rows._table, rows._whole = getattr(whole, "shape", ()), None, whole
+        return rows
+
+    def __getitem__(self, rows: Any) -> Any:
+        return self._whole[rows] if self._table is None else self._table.computed(rows)[rows]
 
     @property
-    def whole(self) -> np.ndarray:
-        """All rows, as a read-only array."""
+    def whole(self) -> Any:
+        """All rows; those that were computed as a read-only array."""
+        if self._table is None:
+            return self._whole
         rows = self._table.computed()
         rows.setflags(write=False)
         return rows
 
     def tree_flatten(self) -> tuple[tuple[Any], None]:
-        return (self.whole if self._stand_in is None else self._stand_in,), None
+        return (self.whole,), None
 
     @classmethod
-    def tree_unflatten(cls, _: None, children: tuple[Any]) -> Any:
-        (rows,) = children
-        if isinstance(rows, np.ndarray | jax.Array):
-            return rows
-        # What stands for the array, such as its shape in `jit(...).lower`, keeps the structure of the tree.
-        node = object.__new__(cls)
-        node._stand_in = rows
-        return node
+    def tree_unflatten(cls, _: None, children: tuple[Any]) -> DeferredRows:
+        return cls.of(children[0])
 
     def __reduce__(self) -> Any:
-        return (np.asarray, (self.whole,)) if self._anew is None or self._table.complete else (self._anew, ())
+        if self._table is None or self._table.complete or self._anew is None:
+            return DeferredRows.of, (self.whole,)
+        return self._anew, ()
 
 
-# `isinstance` without a Python function: the first is asked of every node of a tree, the second of every array.
-is_deferred: Callable[[object], bool] = DeferredRows.__instancecheck__
+def is_deferred(node: object) -> bool:
+    """Whether a node of a tree is a concrete array of which some rows may not be computed yet."""
+    return isinstance(node, DeferredRows) and node._table is not None
+
+
+# `isinstance` without a Python function, since these are asked of every array and of every node of a tree.
 is_tracer: Callable[[object], bool] = jax.core.Tracer.__instancecheck__
+has_rows: Callable[[object], bool] = DeferredRows.__instancecheck__
+_known_rows = attrgetter("_whole")
 
 
 def is_concrete(*trees: object) -> bool:
     """Whether every array in the trees is concrete, that is, none is a tracer of a JAX transformation."""
-    return not any(map(is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred)))
+    leaves = jax.tree.leaves(trees, is_leaf=has_rows)
+    return not any(map(is_tracer, chain(leaves, map(_known_rows, filter(has_rows, leaves)))))
 
 
 # Traced inside a trace. The call of a program takes a quarter of the time of an operation.
@@ -110,7 +126,8 @@ def canonical_float() -> Any:
 def numpy_for(*trees: object) -> ModuleType:
     """NumPy if every array is concrete, so that nothing is compiled; `jax.numpy` if one is traced."""
     # `is_concrete` written out: most formulas ask this.
-    return jnp if any(map(is_tracer, jax.tree.leaves(trees, is_leaf=is_deferred))) else np
+    leaves = jax.tree.leaves(trees, is_leaf=has_rows)
+    return jnp if any(map(is_tracer, chain(leaves, map(_known_rows, filter(has_rows, leaves))))) else np
 
 
 def constant(tree: Any) -> Any:

@@ -18,7 +18,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from mcgicp_jax._compute.concrete import AnyArray, is_concrete, is_deferred, is_tracer
+from mcgicp_jax._compute.concrete import AnyArray, has_rows, is_concrete, is_tracer
 from mcgicp_jax._compute.threads import in_new_thread, side_by_side, with_settings_of_package
 
 
@@ -81,7 +81,8 @@ class SideBySide(AbstractLinearMap):
 
 def primal(tree: Any) -> Any:
     """The tree with NumPy values in place of tracers of `grad` and `jvp`. Tracers of `jit` and `vmap` remain."""
-    leaves, structure = jax.tree.flatten(tree, is_leaf=is_deferred)
+    # Deferred rows are integers, which derivatives do not trace.
+    leaves, structure = jax.tree.flatten(tree, is_leaf=has_rows)
     if not any(map(is_tracer, leaves)):
         return tree
     for i, leaf in enumerate(leaves):
@@ -232,7 +233,7 @@ mlir.register_lowering(_linear, partial(_refused, message=_ADVICE))
 def without_derivative(tree: Any, inputs: Any, message: str) -> Any:
     """The arrays of a tree, which depend on `inputs`, but have no derivative by them: reverse mode raises
     `NotImplementedError` with the message where it would use it, and forward mode gives NaN."""
-    leaves = jax.tree.leaves(inputs, is_leaf=is_deferred)
+    leaves = jax.tree.leaves(inputs, is_leaf=has_rows)
     tracers = [leaf for leaf in leaves if is_tracer(leaf) and _is_float(leaf)]
     if not tracers:
         return tree

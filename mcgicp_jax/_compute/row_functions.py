@@ -416,7 +416,7 @@ class _Derivative(AbstractLinearMap):
 
 def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input], total: bool = False) -> Any:
     """A row function of whole arrays, inside transformations; rows of many neighbourhoods are computed in blocks."""
-    numbers, inputs = jax.tree.map(jnp.asarray, (numbers, inputs))
+    numbers, inputs = jax.tree.map(jnp.asarray, numbers), _as_arrays(inputs)
     num_rows = size_of(inputs[0])
     wide = any(entry.index is not None and entry.index.ndim == 2 for entry in inputs)
     if total or not wide or num_rows <= _LARGEST_WHOLE:
@@ -428,9 +428,14 @@ def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Inpu
     return jax.tree.map(lambda leaf: leaf.reshape(padded.size, *leaf.shape[2:])[:num_rows], results)
 
 
+def _as_arrays(inputs: Sequence[Input]) -> list[Input]:
+    indices = [None if entry.index is None else entry.index[:] for entry in inputs]
+    return jax.tree.map(jnp.asarray, [entry._replace(index=i) for entry, i in zip(inputs, indices, strict=True)])
+
+
 def over_both(function: Callable[..., Any], numbers: Any, one: Sequence[Input], other: Sequence[Input]) -> Any:
     """`over_whole` for two clouds, in one compiled body if their inputs are alike and they are not large."""
-    one, other = jax.tree.map(jnp.asarray, (one, other))
+    one, other = _as_arrays(one), _as_arrays(other)
     trees = [[entry.table for entry in inputs] for inputs in (one, other)]
     sizes = [len(jax.tree.leaves(tree)[0]) for tree in trees]
     structures: list[Any] = [jax.tree.structure(tree) for tree in trees]

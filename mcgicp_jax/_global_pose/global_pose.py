@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, same_channels
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import grid_of, voxel_order
-from mcgicp_jax._compute.concrete import AnyArray, outside_trace
+from mcgicp_jax._compute.concrete import AnyArray, DeferredRows, outside_trace
 from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._global_pose import robust_pose_fit as fit
@@ -198,7 +198,10 @@ def global_pose(
         else:
             matches = matches_of_rows(source.coordinates - centers[0], target.coordinates - centers[1], rows)
         neighbors = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in voxels]
-        voxels = [cloud.replace_rows(deferred_neighbors=near) for cloud, near in zip(voxels, neighbors, strict=True)]
+        voxels = [
+            cloud.replace_rows(deferred_neighbors=DeferredRows.of(near))
+            for cloud, near in zip(voxels, neighbors, strict=True)
+        ]
         positions = np.asarray(voxels[0].points, np.float64)
         radius = float(np.sqrt(np.mean(np.sum(positions * positions, axis=1))))
         return _best_pose(_Scene(matches, voxels[0], voxels[1], size, radius), *centers)

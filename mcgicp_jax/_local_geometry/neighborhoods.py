@@ -81,7 +81,7 @@ def check_neighbors(cloud: PointCloud, xp: ModuleType) -> Any:
     deferred = cloud.deferred_neighbors
     if deferred is None:
         raise ValueError(NO_NEIGHBORS)
-    return deferred if xp is np and is_deferred(deferred) else xp.asarray(cloud.neighbors)
+    return deferred if xp is np and is_deferred(deferred) else xp.asarray(deferred.whole)
 
 
 class PointRows(NamedTuple):

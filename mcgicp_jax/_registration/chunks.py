@@ -20,6 +20,7 @@ from jaxtyping import Array, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess_inside_jit import traced_neighbors
+from mcgicp_jax._compute.concrete import DeferredRows
 from mcgicp_jax._compute.devices import default_devices
 from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._compute.threads import with_settings_of_package
@@ -292,7 +293,7 @@ def _registered(
             if clouds.deferred_neighbors is None:
                 at_a_time = max(1, _ROWS_WITH_NEIGHBORS // clouds.valid.shape[-1])
                 neighbors = jax.lax.map(find, clouds, batch_size=at_a_time)
-                chunk = chunk._replace(**{name: clouds.replace_rows(deferred_neighbors=neighbors)})
+                chunk = chunk._replace(**{name: clouds.replace_rows(deferred_neighbors=DeferredRows.of(neighbors))})
         return Packed.of(jax.vmap(registered, (0, None))(chunk, common))
 
     common = method, robust, numbers, max_updates

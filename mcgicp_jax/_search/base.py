@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from mcgicp_jax._compute.concrete import AnyArray
+from mcgicp_jax._compute.concrete import AnyArray, DeferredRows
 
 
 class SearchPoints(NamedTuple):
@@ -138,6 +138,8 @@ class AbstractSearch(eqx.Module):
         The points are finite, in metres. The row is −1 where there are fewer than k points.
         """
 
-    def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> Any:
-        """`neighbors`, as an array or as `DeferredRows`."""
-        return self.neighbors(points, num_neighbors)
+    def neighbors_on_demand(self, points: Float[np.ndarray, "N 3"], num_neighbors: int) -> DeferredRows:
+        """`neighbors`, perhaps found when they are needed."""
+        neighbors = self.neighbors(points, num_neighbors).astype(np.int32, copy=False)
+        neighbors.setflags(write=False)
+        return DeferredRows.of(neighbors)

@@ -62,6 +62,10 @@ class OdometryStep:
     lost: bool = False
     deferred_graph: Lazy[PoseGraph] | None = None
 
+    def __repr__(self) -> str:
+        position = ", ".join(f"{coordinate:.3f}" for coordinate in self.pose[:3, 3])
+        return f"OdometryStep(position ({position}) m{', lost' if self.lost else ''}, {self.cloud!r})"
+
     @property
     def registration(self) -> RegistrationResult | None:
         """Registration of this frame, None for the first; check its `converged`.
