@@ -38,14 +38,17 @@ as two to five registrations, of small clouds with channels up to eight. `regist
 one call.
 
 Inside `jit`, a registration is one program for each size of clouds, which compiles for 8 to 30 s: pad clouds to one
-size by `PointCloud.pad`. Matches come from host callbacks, one batch element at a time, or with `DenseSearch` from XLA.
-The pose is the same up to rounding, unless that of a second registration replaces it outside.
+size by `PointCloud.pad`. `vmap`, `lax.scan`, `lax.cond`, `lax.map` and `jax.checkpoint` trace it as well, also outside
+`jit`; `shard_map` needs `check_vma=False`. Matches come from host callbacks, one batch element at a time, or with
+`DenseSearch` from XLA. The pose is the same up to rounding, unless that of a second registration replaces it outside.
 
 ## Derivatives
 
 Poses have first derivatives by points, channels, given covariances, given parameters of the method and the scale of
-`robust`. The derivative by `init` is 0. Matches, neighbours and estimated parameters are constants. The derivative is
-that of `estimate_pose` for the matches of the last update.
+`robust`. The derivatives by `init` and the other options are 0. Matches, neighbours and estimated parameters are
+constants, as are `status`, `num_inliers` and `overlap`; `cost`, `rmse` and `covariance` raise an error in reverse mode.
+The derivative is that of `estimate_pose` for the matches of the last update. That by a whole cloud includes its
+`origin`: replace the points or channels of the cloud by those that were stepped along it, not the cloud.
 
 Channels change a pose mostly by which points match, and α does so by this alone. Where a method matches by channels
 (not with `photometric=True`), the derivative is therefore by default that of soft matches: of the root of

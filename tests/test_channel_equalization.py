@@ -129,8 +129,11 @@ def test_another_exposure_is_told(photometric):
     )
     method = mcg.MultiChannelGICP(photometric=photometric)
     dark = source.replace(channels=0.5 * np.asarray(source.channels))
-    with pytest.warns(UserWarning, match="channel red: "):
-        mcg.register(dark, target, method)
+    saturated = source.replace(channels=np.minimum(1.5 * np.asarray(source.channels), 1))
+    for changed in (dark, saturated):
+        with pytest.warns(UserWarning, match="channel red: "):
+            # The wall constrains only half of the directions, its posters the others.
+            assert not mcg.register(changed, target, method).converged
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert mcg.register(source, target, method).converged

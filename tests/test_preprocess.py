@@ -227,6 +227,8 @@ RAYS = np.stack([np.cos(2 * np.pi * np.arange(0.1, 600) / 600), np.sin(2 * np.pi
 WALLS = np.where(RAYS > 0, [[12], [12.5]], [[12], [1.5]])
 HALL = (RAYS / np.max(np.abs(RAYS) / WALLS, axis=0)).T + 0.02 * np.random.default_rng(0).normal(size=(600, 2))
 COPIES = np.concatenate([np.insert(HALL, 2, height, axis=1) for height in 3.0 * np.arange(5)])
+# Rays from a sensor at a height of 1.6 m that end on the floor or above it.
+FLOOR = np.stack([*SPREAD.T[:2], np.where(LEVELS > 0, SPREAD[:, 2], 1.1e-16 * (np.rint(AROUND) % 4 - 1))], axis=1)
 # Points, and the step to which they are rounded, metres; 0 where it does no harm.
 ROUNDED = {
     "as they are": (SPREAD, 0),
@@ -247,6 +249,7 @@ ROUNDED = {
     "height map in float32": ((height_map() + np.rint(UTM)).astype(np.float32), 0),
     "copies of a planar scan": (COPIES, 0),
     "each of ten points five times": (np.tile(POINTS[:10], (5, 1)), 0),
+    "a floor at 0 up to rounding": (FLOOR, 0),
 }
 
 

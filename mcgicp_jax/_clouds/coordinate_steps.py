@@ -59,8 +59,10 @@ def _steps(cloud: PointCloud) -> tuple[Float[AnyArray, "3"], Bool[AnyArray, "3"]
         # The step of float32 at these coordinates, by its 23 bits of fraction.
         size = xp.max(xp.where(counts, xp.abs(values + xp.asarray(cloud.origin)[:, None]), 0), axis=1)
         float32 = xp.abs(step * 2.0 ** (23 - xp.floor(xp.log2(size))) - 1) < _TOLERANCE
-        # A step s of 1/z is one of z² s at the depth z.
-        step = xp.where(step > 0, step, _step_between(1 / values) * median(values**2))
+        # A step s of 1/z is one of z² s at the depth z. Coordinates that are 0 up to rounding, as of a floor, are none.
+        largest = xp.max(xp.where(xp.isfinite(values), xp.abs(values), 0), axis=1, keepdims=True)
+        depths = xp.where(xp.abs(values) > _ROUNDINGS * xp.finfo(values.dtype).eps * largest, values, xp.nan)
+        step = xp.where(step > 0, step, _step_between(1 / depths) * median(values**2))
     return xp.where(step > 0, step, 0).astype(values.dtype), float32
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 from mcgicp_jax._clouds.columns import COLORS, arrays_of
 from mcgicp_jax._clouds.depth_images import back_project
 from mcgicp_jax._compute.concrete import DeferredRows, is_concrete
-from mcgicp_jax._compute.messages import messages_named
+from mcgicp_jax._compute.messages import check_concrete, messages_named
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
@@ -290,8 +290,9 @@ class PointCloud(eqx.Module):
     def replace(self, **arrays: Any) -> PointCloud:
         """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).
 
-        An existing `channel_valid` also applies to new `channels`. `points` are relative to `origin`; `neighbors` stay
-        as they were, constants to autodiff: after moves comparable to the spacing, preprocess again.
+        `channels` may be (N,) for a single one; an existing `channel_valid` applies to them, too. `points` are relative
+        to `origin`; `neighbors` stay as they were, constants to autodiff: after moves comparable to the spacing,
+        preprocess again.
 
         Raises:
             ValueError: if a field does not exist, or a shape or dtype does not fit the cloud.
@@ -312,7 +313,9 @@ class PointCloud(eqx.Module):
                 # JAX warns of conversions to float64 where it has none.
                 dtype = dtype if isinstance(array, np.ndarray) else jax.dtypes.canonicalize_dtype(dtype)
                 # Of traced arrays, even a conversion to the same dtype would be compiled.
-                arrays[name] = array if array.dtype == dtype else array.astype(dtype)
+                array = array if array.dtype == dtype else array.astype(dtype)
+                single = name == "channels" and array.ndim < np.ndim(self.points)
+                arrays[name] = array[..., None] if single else array
         if np.ma.is_masked(channels):
             valid = arrays.get("channel_valid", self.channel_valid)
             arrays["channel_valid"] = _checked_mask(channels, valid, np.shape(channels))
@@ -382,7 +385,12 @@ class PointCloud(eqx.Module):
         return f"PointCloud({', '.join(parts)})"
 
     def unpad(self) -> PointCloud:
-        """Return the valid rows as a raw cloud: NumPy arrays in the user's frame, float64 if `origin` is not 0."""
+        """Return the valid rows as a raw cloud: NumPy arrays in the user's frame, float64 if `origin` is not 0.
+
+        Raises:
+            ValueError: if the cloud is traced or a batch.
+        """
+        check_concrete("cloud", self)
         valid = np.asarray(self.valid)
         all_valid = bool(valid.all())
 
@@ -412,8 +420,7 @@ class PointCloud(eqx.Module):
         """
         if not 0 <= min_range <= max_range:
             raise ValueError(f"min_range: expected 0 to max_range = {max_range}, got {min_range}")
-        if not is_concrete(self):
-            raise ValueError("cloud: expected concrete arrays, got tracers; crop outside of jit and vmap")
+        check_concrete("cloud", self)
         ranges = np.linalg.norm(self.coordinates, axis=-1)
         inside = np.asarray(self.valid) & (ranges >= min_range) & (ranges <= max_range)
         return self.replace_rows(valid=inside).unpad()
@@ -496,15 +503,20 @@ class PointCloud(eqx.Module):
         """Stack clouds along a new leading batch dimension for `jax.vmap`, padded as `pad()` pads the largest.
 
         Raises:
-            ValueError: if there are no clouds, or their channel names differ.
+            ValueError: if there are no clouds, or they differ in channels, number of neighbours or covariances.
         """
         if not clouds:
             raise ValueError("clouds: expected at least one, got none")
         size = max(size_class(cloud.points.shape[0]) for cloud in clouds)
-        names = clouds[0].channel_names
+
+        def kind(cloud: PointCloud) -> str:
+            neighbors = 0 if cloud.deferred_neighbors is None else cloud.deferred_neighbors.shape[-1]
+            covariances = "no covariances" if cloud.covariances is None else "covariances"
+            return f"the channels {cloud.channel_names}, {neighbors} neighbors and {covariances}"
+
         for i, cloud in enumerate(clouds):
-            if cloud.channel_names != names:
-                raise ValueError(f"clouds[{i}]: expected the channels {names}, got {cloud.channel_names}")
+            if kind(cloud) != kind(clouds[0]):
+                raise ValueError(f"clouds[{i}]: expected {kind(clouds[0])}, got {kind(cloud)}")
         if any(cloud.channel_valid is not None for cloud in clouds):
             masks = [np.ones(cloud.channels.shape, bool) for cloud in clouds]
             clouds = [

@@ -83,6 +83,8 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
     none = [None] * len(clouds)
     if isinstance(voxel_size, Voxels):
         return voxel_size, none
+    if not is_concrete(voxel_size):
+        raise ValueError(f"voxel_size: expected a number that is not traced, as voxels are constants, got {voxel_size}")
     if voxel_size != "auto":
         return Voxels(voxel_size), none
     preprocessed = [cloud for cloud in clouds if cloud.voxel_size is not None]

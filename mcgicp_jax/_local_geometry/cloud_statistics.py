@@ -32,9 +32,13 @@ _QUANTILES = tuple(step / 20 for step in range(1, 20))
 # Ratio of the ranges of a channel in two clouds above which its units probably differ: files hold intensities from 0 to
 # 1, 255 or 65,535, whereas exposures differ by less.
 _OTHER_UNIT = 10.0
-# Gain between the channels of two clouds from which on a warning is issued. In simulated pairs, it was between 0.9 and
-# 1.1 with the same exposure, and 1.8 to 2.2 with half the exposure, which moved the pose by up to 0.1 m.
+# Gain between the channels of two clouds from which on matched values are compared. In simulated pairs, it was between
+# 0.9 and 1.1 with the same exposure, and 1.8 to 2.2 with half the exposure, which moved the pose by up to 0.1 m.
 _OTHER_EXPOSURE = 1.5
+# Change of the ends of the range at matched points, over the range, from which on exposures differ. On textured walls
+# with one exposure it was 0.006 at most, with a gain of 1.2 up to 0.13 (poses 1 to 6 deviations off), and with gains of
+# 1.5 and 1.9 from 0.15 to 0.31 (2 to 9 deviations), also where bright colours were clipped.
+_OTHER_LEVEL = 0.15
 
 
 def channel_noise(
@@ -145,21 +149,23 @@ def warn_of_units(source: PointCloud, target: PointCloud) -> None:
             )
 
 
-def warn_of_exposure(source: PointCloud, target: PointCloud, matches: Callable[[], Correspondences]) -> None:
-    """Warn of channels that differ by a gain between matched points; `matches` is called if the ranges differ, too."""
+def changes_of_exposure(
+    source: PointCloud, target: PointCloud, matches: Callable[[], Correspondences], by_channels: bool
+) -> list[str]:
+    """What to say of channels whose values differ at matched points, probably because of another exposure. `matches` is
+    called if the ranges of all values differ, too, or if channels alone constrain the pose (`by_channels`)."""
     ranges = [_ranges(cloud) for cloud in (source, target)]
     widths = [sorted([high - low, last - first]) for (low, high), (first, last) in zip(*ranges, strict=False)]
-    if not any(_OTHER_EXPOSURE * narrow < wide <= _OTHER_UNIT * narrow for narrow, wide in widths):
-        return
-    gains = np.asarray(_gains_and_offsets(source, target, matches())[0])
-    for name, gain in zip(source.channel_names, gains, strict=True):
-        if not 1 / _OTHER_EXPOSURE < gain < _OTHER_EXPOSURE:
-            # Without the gain, so that Python shows the warning once.
-            warn(
-                f"channel {name}: the spreads of its values at matched points of source and target differ by a factor "
-                f"of more than {_OTHER_EXPOSURE}, which displaces the pose; if the exposure differs, use "
-                "equalize_channels=True"
-            )
+    if not by_channels and not any(_OTHER_EXPOSURE * narrow < wide <= _OTHER_UNIT * narrow for narrow, wide in widths):
+        return []
+    maps = zip(*map(np.asarray, _gains_and_offsets(source, target, matches())), strict=True)
+    return [
+        # Without numbers, so that Python shows a warning once.
+        f"channel {name}: its values at matched points of source and target differ by more than {_OTHER_LEVEL:.0%} of "
+        "their range, which displaces the pose; if the exposure differs, use equalize_channels=True"
+        for name, (gain, offset), ends in zip(source.channel_names, maps, ranges[0], strict=True)
+        if max(abs(gain * end + offset - end) for end in ends) > _OTHER_LEVEL * (ends[1] - ends[0])
+    ]
 
 
 @cached_with_cloud

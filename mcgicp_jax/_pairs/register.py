@@ -126,8 +126,8 @@ def register(
     Warns:
         UserWarning: if points with NaN or infinity are left out; `MultiChannelGICP` gets clouds without channels; the
             values of a channel differ so much between the clouds that its units probably differ; the channels of
-            matched points differ by a factor, probably because of another exposure; channels seem to move with the
-            sensor (they are left out, or a pose that they alone hold is UNVERIFIED); extent and spacing of the clouds
+            matched points differ, probably because of another exposure, or channels seem to move with the sensor and
+            are left out (a pose that such channels alone hold is UNVERIFIED); extent and spacing of the clouds
             differ so much that their units of length probably differ; or `GICP` gets one cloud with covariances that
             are not dimensionless. Outside of `jit`: if the pose is UNVERIFIED, or `global_pose` finds none, why; if
             channels or `channel_weights` are differentiated with `soft_matches=False`; or if channels are

@@ -81,9 +81,10 @@ class Options:
                 raise ValueError(f"{name}: expected an object such as {example}, or None, got {value!r}")
         for name in ("hold_unconstrained", "equalize_channels", "soft_matches"):
             value = getattr(self, name)
-            if name == "soft_matches" and value is None:
+            concrete = is_concrete(value)
+            if (name == "soft_matches" and value is None) or (name == "hold_unconstrained" and not concrete):
                 continue
-            if is_concrete(value) and np.asarray(value).dtype != bool:
+            if not concrete or np.asarray(value).dtype != bool:
                 raise ValueError(f"{name}: expected True or False, got {value!r}")
         if isinstance(self.voxel_sizes, str) or np.ndim(self.voxel_sizes) != 1:
             raise ValueError(f"voxel_sizes: expected a sequence of voxel sizes in metres, got {self.voxel_sizes!r}")

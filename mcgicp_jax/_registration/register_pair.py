@@ -19,7 +19,7 @@ from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
-from mcgicp_jax._local_geometry.cloud_statistics import warn_of_exposure, with_channels_matched
+from mcgicp_jax._local_geometry.cloud_statistics import changes_of_exposure, with_channels_matched
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
 from mcgicp_jax._local_geometry.sensor_patterns import (
     channels_may_move,
@@ -198,7 +198,14 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run))
         run = solve(again, _final_pose(run), replace(options, max_coarse_distance=0.0))
     elif not traced and given.method.uses_channels and not options.equalize_channels:
-        warn_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run))
+        directions = run.loop.state.directions
+        by_channels = directions is not None and bool(np.any(directions.constrained_by_channels))
+        changes = changes_of_exposure(inputs.source, inputs.target, lambda: _nearest_points(run), by_channels)
+        if by_channels and not doubt and run.loop.state.status == Status.CONVERGED:
+            doubt = "; ".join(changes)
+        else:
+            for change in changes:
+                warn(change)
     if measures:
         # Again from its pose, with tie points and prior weighed by its covariance.
         if run.executor is None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import equinox as eqx
+import jax
 import jaxlie
 import numpy as np
 from jax.typing import ArrayLike
@@ -45,7 +46,7 @@ class Status(enum.IntEnum):
             with the coarse `max_distance` the registration does not converge; with `init="global"`, `global_pose` had
             no success; the pose contradicts the `prior`, by more standard deviations than in one of a million right
             cases; or channels alone hold it along some direction, and are so simple a function of position that they
-            may move with the sensor.
+            may move with the sensor, or outside of transformations, differ at matched points as by another exposure.
     """
 
     CONVERGED = 0
@@ -79,8 +80,8 @@ _ADVICE = {
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
     Status.UNVERIFIED: "the clouds may not show the same place, few points match, other poses fit as well, the prior "
-    "contradicts it, or channels that may move with the sensor hold it; look at the clouds at this pose, or try clouds "
-    "that show more of the scene",
+    "contradicts it, or channels hold it that may move with the sensor or have another exposure; look at the clouds at "
+    "this pose, or try clouds that show more of the scene",
 }
 
 
@@ -247,7 +248,10 @@ class RegistrationResult(eqx.Module):
             ValueError: in copies, such as the results of batches and odometry, and inside transformations.
         """
         if self.derivative.value is None:
-            raise ValueError("jacobian: expected the result of register or estimate_pose itself, got a copy")
+            raise ValueError(
+                "jacobian: expected the result of register or estimate_pose itself, outside of transformations, got a "
+                "copy or a traced result"
+            )
         if cloud not in ("source", "target") or field not in ("points", "channels", "covariances"):
             raise ValueError(f'jacobian: expected an array such as ("source", "points"), got {(cloud, field)!r}')
         return self.derivative.value(cloud, field)
@@ -286,6 +290,9 @@ class RegistrationResult(eqx.Module):
         return unconstrained_directions(self.directions)
 
     def __repr__(self) -> str:
+        # Leaves may be no arrays, as after `jax.eval_shape` or `jax.tree.map`.
+        if not isinstance(self.status_code, int | np.generic | np.ndarray | jax.Array):
+            return f"RegistrationResult(status_code={self.status_code!r})"
         if not is_concrete(primal(self.centred), self.history) or np.ndim(self.status_code):
             return f"RegistrationResult(batch of shape {np.shape(self.status_code)})"
         matrix, origin = np.asarray(primal(self.matrix)), np.append(np.asarray(primal(self.source_origin)), 1)
