@@ -182,13 +182,14 @@ def test_replace_exchanges_and_leaves_the_rest():
 def test_replace_refuses_what_does_not_fit():
     for name, *shapes in (
         ("points", (159, 3), (160, 2)),
-        ("channels", (159, 2), (160,)),
+        ("channels", (159, 2), (159,)),
         ("covariances", (160, 3), (5,)),
         ("replace", (160, 3)),
     ):
         for shape in shapes:
             given = {"colour" if name == "replace" else name: np.zeros(shape)}
             refused(lambda given=given: ready().replace(**given), name)
+    assert ready().replace(channels=np.zeros(160)).channels.shape == (160, 1)
 
 
 @pytest.mark.parametrize("form", ["numpy", "jax", "jaxlie"])
