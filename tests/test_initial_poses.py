@@ -102,15 +102,15 @@ def test_a_degenerate_pose_keeps_its_initial_value(count, seed, low):
     assert result.status is Status.DEGENERATE and error(result) < 0.1
 
 
-@pytest.mark.parametrize("seed", [4, 12])
-def test_a_converged_pose_replaces_one_that_is_still_changing(seed):
-    """From the truth the coarse phase slides 3 m along the corridor, and is at no rest there."""
+@pytest.mark.parametrize(("count", "seed", "low"), [(200, 6, 3.5), (300, 9, 4.5)])
+def test_a_converged_pose_replaces_one_that_is_still_changing(count, seed, low):
+    """From the truth the coarse phase slides 3 to 4 m along the corridor, and is at no rest there."""
     with pytest.warns(UserWarning, match="another that is still changing, "):
-        result = mcg.register(corridor(300, 2.75, 13.75, 2 * seed + 1), corridor(300, 0, 11, 2 * seed), GICP)
-    assert result.status is Status.UNVERIFIED and error(result) < 0.3
+        result = mcg.register(corridor(count, low, 11 + low, 2 * seed + 1), corridor(count, 0, 11, 2 * seed), GICP)
+    assert result.status is Status.UNVERIFIED and error(result) < 0.5
 
 
-@pytest.mark.parametrize(("count", "seed"), [(300, 1), (600, 0)])
+@pytest.mark.parametrize(("count", "seed"), [(300, 1), (600, 11)])
 def test_a_pose_far_from_the_initial_one_is_unverified_if_surfaces_coincide_near_it(count, seed):
     with pytest.warns(UserWarning, match=r"4\.\d m from this one, where the surfaces coincide about as well"):
         result = mcg.register(corridor(count, 5, 16, 2 * seed + 1), corridor(count, 0, 11, 2 * seed), GICP)

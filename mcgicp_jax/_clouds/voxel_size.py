@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from mcgicp_jax._clouds.point_cloud import PLANAR_ADVICE, PointCloud, Voxels
 from mcgicp_jax._clouds.rays_without_return import measured_rows
 from mcgicp_jax._clouds.voxels import VOXELS_PER_AXIS, Grid, grid_of
-from mcgicp_jax._compute.concrete import is_concrete
+from mcgicp_jax._compute.concrete import is_concrete, is_tracer
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
@@ -83,7 +83,7 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
     none = [None] * len(clouds)
     if isinstance(voxel_size, Voxels):
         return voxel_size, none
-    if not is_concrete(voxel_size):
+    if is_tracer(voxel_size):
         raise ValueError(f"voxel_size: expected a number that is not traced, as voxels are constants, got {voxel_size}")
     if voxel_size != "auto":
         return Voxels(voxel_size), none

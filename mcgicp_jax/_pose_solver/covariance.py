@@ -186,7 +186,8 @@ def _discounted_observability(
     posed: PosedMatches, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6 n"]:
     fractions = observability(posed, terms, np.bool_(True))
-    shown = discount[0] * fractions["observability"]
+    slide = all(term.matches_slide for term in terms)
+    shown = discount[0] * fractions["observability" if slide else "common"]
     channels = fractions.get("channel_observability")
     if channels is not None:
         # Their agreement is unbiased only for matches that are nearest in position.

@@ -100,12 +100,12 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
         constraints: rows that are orthogonal to the free twists, and rows of zeros. Eigenvectors are those within the
             free twists; the other directions are fixed. None if all are free.
     """
-    if sums.mass is None or sums.observability is None:
+    if sums.mass is None or sums.observability is None or sums.common is None:
         raise ValueError("sums: expected those of surfaces with observability")
     center, radius = sums.center, sums.radius
     total = jnp.where(sums.mass[3, 3] > 0, sums.mass[3, 3], 1)
     motion = twist_form(_IDENTITY.astype(total.dtype)[:, None, None] * (sums.mass / total), radius)
-    geometry = twist_form(sums.observability / total, radius)
+    geometry, common = (twist_form(moments / total, radius) for moments in (sums.observability, sums.common))
     # Each decomposition needs the result of the last: concurrent batched LAPACK calls can deadlock XLA's thread pool.
     # The floor: points on a line do not move when they turn about it, so that rotation is not observed.
     values, vectors = jnp.linalg.eigh(motion)
@@ -121,20 +121,24 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
         ties = jnp.where(fixed, jnp.inf, 0)
     # 2 and 3, above any fraction, sort the other directions last.
     seen = jnp.where(jnp.outer(~fixed, ~fixed), basis.T @ geometry @ basis, jnp.diag(2.0 * fixed))
-    shares, turn = jnp.linalg.eigh(seen)
-    basis = basis @ turn
-    free = ~(shares >= LEAST_BY_GEOMETRY)
+    basis = basis @ jnp.linalg.eigh(seen)[1]
+
+    def along(form: Float[Array, "6 6"]) -> Float[Array, "6"]:
+        return jnp.sum(basis * (form @ basis), axis=0)
+
+    # The directions stay those along which the pose was updated; geometry constrains what both clouds observe.
+    shares = jnp.minimum(along(geometry), along(common))
     if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
-        channels, shares = jnp.zeros_like(shares), jnp.where(fixed, jnp.sum(basis * (geometry @ basis), axis=0), shares)
+        channels = jnp.zeros_like(shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
     # Diagonalise the channels within the free directions.
+    free = ~(shares >= LEAST_BY_GEOMETRY) & ~fixed
     among = jnp.outer(free, free)
     within = twist_form(sums.channel_observability / total, radius)
     seen, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free + fixed)))
     basis = basis @ turn
-    # Where the channels disagree, the directions stay those along which the pose was updated.
-    forms = geometry, *(twist_form(moments / total, radius) for moments in (sums.agreement, sums.surplus))
-    shares, agreed, surplus = (jnp.sum(basis * (form @ basis), axis=0) for form in forms)
+    shares = jnp.minimum(along(geometry), along(common))
+    agreed, surplus = (along(twist_form(moments / total, radius)) for moments in (sums.agreement, sums.surplus))
     agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
     channels = jnp.where((seen > 0) & (agreed < _AGREE * seen), agreed - _AGREE * seen, seen)
     channels = jnp.where(seen > 1.5, 0, channels)

@@ -25,7 +25,7 @@ from mcgicp_jax._terms.base import AbstractTerm, PosedMatches
 # up to 0.017 along free directions (D2D-NDT), crossing planes 0.0025; yards, streets, rooms and RGB-D at least 0.025.
 _BY_CHANCE = 0.02
 # Fields of `Sums` that are sums over h hᵀ.
-_SECOND_MOMENTS = ("stiffness", "mass", "observability", "channel_observability", "agreement", "surplus")
+_SECOND_MOMENTS = ("stiffness", "mass", "observability", "common", "channel_observability", "agreement", "surplus")
 
 
 class Sums(NamedTuple):
@@ -47,6 +47,7 @@ class Sums(NamedTuple):
         mass: Σ w h hᵀ without points near the sensor, as the following; None where observability is not known.
         observability: Σ w O ⊗ h hᵀ by the shape of the surfaces, less that of points near the sensor; None where it is
             not known.
+        common: the same by what both surfaces observe, in the last step; before it, `observability`.
         channel_observability: the same by the channels; None also where they are not used.
         agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where the
             slopes are not known, as before the last step.
@@ -64,6 +65,7 @@ class Sums(NamedTuple):
     stiffness: Float[AnyArray, "*batch 6 4 4"]
     mass: Float[AnyArray, "*batch 4 4"] | None = None
     observability: Float[AnyArray, "*batch 6 4 4"] | None = None
+    common: Float[AnyArray, "*batch 6 4 4"] | None = None
     channel_observability: Float[AnyArray, "*batch 6 4 4"] | None = None
     agreement: Float[AnyArray, "*batch 6 4 4"] | None = None
     surplus: Float[AnyArray, "*batch 6 4 4"] | None = None
@@ -128,7 +130,8 @@ def sums_of(
         far = jnp.sum(jnp.square(jnp.asarray(posed.source.points)), axis=1) >= near**2
         evidence = jnp.where(far, total.weight, 0)
         rows["mass"] = evidence[None]
-        rows["observability"] = jnp.where(far, total.weight, -total.weight) * fractions.pop("observability")
+        against = jnp.where(far, total.weight, -total.weight)
+        rows |= {name: against * fractions.pop(name) for name in ("observability", "common")}
         rows |= {name: evidence * fraction for name, fraction in fractions.items()}
     ends = np.cumsum([len(row) for row in rows.values()])
     split = jnp.split(moments_about(jnp.concatenate(list(rows.values())), h), ends[:-1])
@@ -169,22 +172,29 @@ def observability(
     posed: PosedMatches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]
 ) -> dict[str, Float[Array, "6 n"]]:
     """O per correspondence, in the target's frame, by its name in `Sums`: mean over its two points, by shape, and where
-    channels are used, by channels; and if the surfaces have `noise` with slopes, their agreement and its surplus.
+    channels are used, by channels; what both points have in common; and if the surfaces have `noise` with slopes, their
+    agreement and its surplus.
+
+    What the O of both points by shape, A and B, have in common is (A B + B A) / 2, divided by the root mean square of
+    |A| and |B|: A where they are equal. At the end of a box of which one scan shows a face that the other does not,
+    some points match across the edge, and with the mean alone these constrained the slide along the box, as bent scan
+    lines did in tunnels. Before the `last` sums, the mean stands for it: far from the right pose, matches have nothing
+    in common, and the directions that each cloud observes guide the pose.
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
-    cell. For cells it is therefore the product of both, whose noise is independent, less what they have in common by
-    chance. Before the `last` sums it is their mean: far from the right pose the cells of a match have nothing in
-    common, and the directions that each cloud observes guide the pose.
+    cell. Cells therefore have the product in common, whose noise is independent, less that of chance.
     """
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
         return {}
     ours, theirs = alg.rotate(rotation, source.observability.T), target.observability.T
-    fractions = {"observability": 0.5 * (ours + theirs)}
-    if not all(term.matches_slide for term in terms):
-        by_chance = _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
-        common = alg.symmetric_product(ours, theirs) - by_chance
-        fractions["observability"] = jnp.where(last, common, fractions["observability"])
+    mean, common = 0.5 * (ours + theirs), alg.symmetric_product(ours, theirs)
+    if all(term.matches_slide for term in terms):
+        square = 0.5 * (alg.square_norm(ours) + alg.square_norm(theirs))
+        common = common / jnp.sqrt(jnp.where(square > 0, square, 1))
+    else:
+        common = common - _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
+    fractions = {"observability": mean, "common": jnp.where(last, common, mean)}
     if source.channel_observability is not None and target.channel_observability is not None:
         ours, theirs = alg.rotate(rotation, source.channel_observability.T), target.channel_observability.T
         fractions["channel_observability"] = 0.5 * (ours + theirs)

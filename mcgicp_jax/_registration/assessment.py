@@ -177,7 +177,7 @@ def registration_of(
         num_inliers=num_inliers,
         cost=constant_by(record.cost),
         rmse=constant_by(record.rmse),
-        overlap=(num_inliers / numpy_for(matchable).maximum(matchable.sum(), 1)).astype(record.rmse.dtype),
+        overlap=(num_inliers / matchable.sum().clip(1)).astype(record.rmse.dtype),
         history=history,
         constraints=assessment.constraints
         if at_origin

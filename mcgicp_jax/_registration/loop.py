@@ -210,9 +210,9 @@ class AbstractExecutor(abc.ABC):
 
     @abc.abstractmethod
     def sums(self, motion: Motion, matches: Matches, terms: tuple[AbstractTerm, ...], last: Bool[AnyScalar, ""]) -> Any:
-        """`sums_of` all correspondences, as the executor keeps them while the loop runs. In the `last` step alone, the
-        channels of matched points must agree, and so must the shapes of cells: far from the right pose they do not, and
-        what each cloud observes guides the pose."""
+        """`sums_of` all correspondences, as the executor keeps them while the loop runs. In the `last` step alone,
+        shapes and channels of matched points must agree: far from the right pose they do not, and what each cloud
+        observes guides the pose."""
 
     def update(self, state: State, sums: Any) -> State:
         """The state after an update of the pose, without the sums."""
