@@ -28,8 +28,8 @@ _NOISE = 0.22
 # would constrain the pose along it. Such a neighbourhood is thick (third extent over the second) and narrow (second
 # over first), but no line. Each pair is a ramp: a half has the weight 0 at the first value and 1 at the second, and the
 # largest of the three weights counts. Of 18 tunnels (16 beams, voxels of 0.1 to 0.3 m) 11 were CONVERGED, six of them
-# wrong, with shares up to 0.0044; of 52 now none, with up to 0.0016. Rooms, garages, corridors, halls and streets
-# have at least 0.0041. Noise makes thick neighbourhoods, too, but they are as wide as long.
+# wrong, with shares up to 0.0044; of 52 now four, two of them wrong, with up to 0.0027. Rooms, garages, corridors,
+# halls and streets have at least 0.0041. Noise makes thick neighbourhoods, too, but they are as wide as long.
 _THICK, _LINE, _NARROW = (0.45, 0.3), (0.25, 0.15), (0.45, 0.65)
 
 

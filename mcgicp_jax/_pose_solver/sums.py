@@ -175,11 +175,12 @@ def observability(
     channels are used, by channels; what both points have in common; and if the surfaces have `noise` with slopes, their
     agreement and its surplus.
 
-    What the O of both points by shape, A and B, have in common is (A B + B A) / 2, divided by the root mean square of
-    |A| and |B|: A where they are equal. At the end of a box of which one scan shows a face that the other does not,
-    some points match across the edge, and with the mean alone these constrained the slide along the box, as bent scan
-    lines did in tunnels. Before the `last` sums, the mean stands for it: far from the right pose, matches have nothing
-    in common, and the directions that each cloud observes guide the pose.
+    What the O of both points by shape, A and B, have in common is their mean, less (|B| A + |A| B) / 2, and plus
+    (A B + B A) / 2: A where they are equal, B / 2 where A is unknown (0), and 0 for two certain normals at right
+    angles. At the end of a box of which one scan shows a face that the other does not, some points match across the
+    edge, and with the mean alone these constrained the slide along the box. Before the `last` sums, the mean stands for
+    it: far from the right pose, matches have nothing in common, and the directions that each cloud observes guide the
+    pose.
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
     cell. Cells therefore have the product in common, whose noise is independent, less that of chance.
@@ -190,8 +191,8 @@ def observability(
     ours, theirs = alg.rotate(rotation, source.observability.T), target.observability.T
     mean, common = 0.5 * (ours + theirs), alg.symmetric_product(ours, theirs)
     if all(term.matches_slide for term in terms):
-        square = 0.5 * (alg.square_norm(ours) + alg.square_norm(theirs))
-        common = common / jnp.sqrt(jnp.where(square > 0, square, 1))
+        sizes = [jnp.minimum(jnp.sqrt(alg.square_norm(one)), 1) for one in (theirs, ours)]
+        common = common + mean - 0.5 * (sizes[0] * ours + sizes[1] * theirs)
     else:
         common = common - _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
     fractions = {"observability": mean, "common": jnp.where(last, common, mean)}
