@@ -60,7 +60,7 @@ _FAR = 0.5
 # which more points lie on surfaces may then win, though these coincide: of 160 views of rooms from 46 to 63° apart, six
 # were CONVERGED up to 1.3 m off, at 0.25 to 0.44. (Now none, and of 73 right ones, five are UNVERIFIED. Right poses of
 # KITTI and tables had at least 0.75, of 7-Scenes and of another LiDAR 0.42; the smaller distance led to them, too.)
-_LITTLE_IN_COMMON = 0.6
+LITTLE_IN_COMMON = 0.6
 # Number of matches that are compared. Four times as many do not separate poses any better.
 _SAMPLE = 1024
 
@@ -157,7 +157,7 @@ def doubt_of_start(
         return None
     fit = measure_fit()
     few = bool(state.record.num_inliers < _MANY)
-    little = bool(fit.overlap < _LITTLE_IN_COMMON) and not at_scales
+    little = bool(fit.overlap < LITTLE_IN_COMMON) and not at_scales
     far = bool(moved > _FAR * settings.max_distance)
     by_shape = (few or far) and not np.any(cast(Directions, state.directions).constrained_by_channels)
     slid = far or state.status == Status.DEGENERATE
@@ -231,7 +231,7 @@ def choice_of(candidates: list[Candidate[AnyRun]], doubt: Doubt, fine: float) ->
     # Why the pose of the best one is ambiguous, and what to pass.
     distances = [distance_moved(best.state.pose, rival.state) for rival in rivals]
     apart = max(distances, default=0.0)
-    common = f"fewer than {_LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
+    common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
     if doubt.little and len(rivals) == 1:
         return best.run, f"{common}registration with a smaller max_distance fails; pass a better initial pose"
     if apart <= fine:
