@@ -47,8 +47,8 @@ size by `PointCloud.pad`. `vmap`, `lax.scan`, `lax.cond`, `lax.map` and `jax.che
 Poses have first derivatives by points, channels, given covariances, given parameters of the method and the scale of
 `robust`. The derivatives by `init` and the other options are 0. Matches, neighbours and estimated parameters are
 constants, as are `status`, `num_inliers` and `overlap`; `cost`, `rmse` and `covariance` raise an error in reverse mode.
-The derivative is that of `estimate_pose` for the matches of the last update. That by a whole cloud includes its
-`origin`: replace the points or channels of the cloud by those that were stepped along it, not the cloud.
+The derivative is that of `estimate_pose` for the matches of the last update. To step
+along a gradient, use `cloud.replace(points=...)`: a step of the whole cloud would move its `origin`, too.
 
 Channels change a pose mostly by which points match, and α does so by this alone. Where a method matches by channels
 (not with `photometric=True`), the derivative is therefore by default that of soft matches: of the root of

@@ -194,7 +194,7 @@ def test_raw_clouds_in_chunks_are_prepared_as_one_by_one(raw, monkeypatch):
 def test_pairs_that_may_have_left_a_right_pose_are_registered_again(monkeypatch):
     """Parts of rooms whose coarse phase leaves it, views with too little in common for a promise, and a whole room that
     is hardly moved."""
-    pairs = [office(0, 500), office(1, 500), views(2, count=500), office(0, 500, common=1)]
+    pairs = [office(0, 500), office(2, 500), views(2, count=500), office(0, 500, common=1)]
     sources, targets, _ = map(list, zip(*pairs, strict=True))
     starts = [None, None, pairs[2].T_target_source, motion((0.06, -0.04, 0.02, 0.02, 0.01, 0.02))]
     doubt_of_start, register_prepared = chunks.doubt_of_start, BatchJob._register_prepared
@@ -219,7 +219,7 @@ def test_pairs_that_may_have_left_a_right_pose_are_registered_again(monkeypatch)
     monkeypatch.setattr(chunks, "doubt_of_start", partial(noted, traced))
     monkeypatch.setattr(BatchJob, "_register_prepared", counted)
     results = batch(range(4))
-    assert [result.status.name for result in results] == ["CONVERGED", "DEGENERATE", "UNVERIFIED", "CONVERGED"]
+    assert [result.status.name for result in results] == ["CONVERGED", "CONVERGED", "UNVERIFIED", "CONVERGED"]
     assert sorted(again) == [0, 1, 2]
     assert_same([result.T_target_source for result in results[:3]], [each.T_target_source for each in expected[:3]])
     assert max(pose_error(results[3].matrix, expected[3].matrix)) < 1e-5

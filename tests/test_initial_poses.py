@@ -102,12 +102,12 @@ def test_a_degenerate_pose_keeps_its_initial_value(count, seed, low):
     assert result.status is Status.DEGENERATE and error(result) < 0.1
 
 
-@pytest.mark.parametrize(("count", "seed", "low"), [(200, 6, 3.5), (300, 9, 4.5)])
+@pytest.mark.parametrize(("count", "seed", "low"), [(300, 31, 3.5), (300, 9, 4.5)])
 def test_a_converged_pose_replaces_one_that_is_still_changing(count, seed, low):
     """From the truth the coarse phase slides 3 to 4 m along the corridor, and is at no rest there."""
     with pytest.warns(UserWarning, match="another that is still changing, "):
         result = mcg.register(corridor(count, low, 11 + low, 2 * seed + 1), corridor(count, 0, 11, 2 * seed), GICP)
-    assert result.status is Status.UNVERIFIED and error(result) < 0.5
+    assert result.status is Status.UNVERIFIED and error(result) < 0.3
 
 
 @pytest.mark.parametrize(("count", "seed"), [(300, 1), (600, 11)])

@@ -457,8 +457,8 @@ class PointCloud(eqx.Module):
 
         arrays = {name: grow(getattr(self, name)) for name in ("points", "channels", "covariances", "times")}
         arrays |= {name: grow(getattr(self, name), False) for name in ("channel_valid", "valid")}
-        neighbors = None if self.neighbors is None else DeferredRows.of(grow(self.neighbors, -1))
-        return self.replace_rows(**arrays, deferred_neighbors=neighbors)
+        neighbors = grow(self.neighbors, -1)
+        return self.replace_rows(**arrays, deferred_neighbors=None if neighbors is None else DeferredRows.of(neighbors))
 
     def replace_rows(self, **arrays: Any) -> PointCloud:
         """Replace fields without checks; the number of rows may change."""

@@ -429,8 +429,8 @@ def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Inpu
 
 
 def _as_arrays(inputs: Sequence[Input]) -> list[Input]:
-    indices = [None if entry.index is None else entry.index[:] for entry in inputs]
-    return jax.tree.map(jnp.asarray, [entry._replace(index=i) for entry, i in zip(inputs, indices, strict=True)])
+    whole = [entry if entry.index is None else entry._replace(index=entry.index[:]) for entry in inputs]
+    return jax.tree.map(jnp.asarray, whole)
 
 
 def over_both(function: Callable[..., Any], numbers: Any, one: Sequence[Input], other: Sequence[Input]) -> Any:

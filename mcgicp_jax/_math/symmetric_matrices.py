@@ -259,12 +259,6 @@ def symmetric_product(a: Float[Array, "6 N"], b: Float[Array, "6 N"]) -> Float[A
     return jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
 
 
-def square_norm(symmetric: Float[Array, "6 N"]) -> Float[Array, "N"]:
-    """The sum of the squares of all nine entries."""
-    xx, xy, xz, yy, yz, zz = symmetric
-    return xx * xx + yy * yy + zz * zz + 2 * (xy * xy + xz * xz + yz * yz)
-
-
 def inverse_3(matrices: Float[AnyArray, "*n 3 3"]) -> Float[AnyArray, "*n 3 3"]:
     """Inverses of symmetric positive definite matrices: cross products of rows over the determinant."""
     xp = numpy_for(matrices)

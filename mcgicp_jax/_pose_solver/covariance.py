@@ -186,6 +186,7 @@ def _discounted_observability(
     posed: PosedMatches, discount: Float[Array, "2"], terms: tuple[AbstractTerm, ...]
 ) -> Float[Array, "6 n"]:
     fractions = observability(posed, terms, np.bool_(True))
+    # Of cells alone the mean is biased, see `observability`.
     slide = all(term.matches_slide for term in terms)
     shown = discount[0] * fractions["observability" if slide else "common"]
     channels = fractions.get("channel_observability")

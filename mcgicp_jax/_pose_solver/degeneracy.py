@@ -122,12 +122,8 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
     # 2 and 3, above any fraction, sort the other directions last.
     seen = jnp.where(jnp.outer(~fixed, ~fixed), basis.T @ geometry @ basis, jnp.diag(2.0 * fixed))
     basis = basis @ jnp.linalg.eigh(seen)[1]
-
-    def along(form: Float[Array, "6 6"]) -> Float[Array, "6"]:
-        return jnp.sum(basis * (form @ basis), axis=0)
-
     # The directions stay those along which the pose was updated; geometry constrains what both clouds observe.
-    shares = jnp.minimum(along(geometry), along(common))
+    shares = jnp.minimum(_along(basis, geometry), _along(basis, common))
     if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
         channels = jnp.zeros_like(shares)
         return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
@@ -137,12 +133,18 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
     within = twist_form(sums.channel_observability / total, radius)
     seen, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free + fixed)))
     basis = basis @ turn
-    shares = jnp.minimum(along(geometry), along(common))
-    agreed, surplus = (along(twist_form(moments / total, radius)) for moments in (sums.agreement, sums.surplus))
+    forms = geometry, common, *(twist_form(moments / total, radius) for moments in (sums.agreement, sums.surplus))
+    by_mean, by_common, agreed, surplus = (_along(basis, form) for form in forms)
+    shares = jnp.minimum(by_mean, by_common)
     agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
     channels = jnp.where((seen > 0) & (agreed < _AGREE * seen), agreed - _AGREE * seen, seen)
     channels = jnp.where(seen > 1.5, 0, channels)
     return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
+
+
+def _along(basis: Float[Array, "6 6"], form: Float[Array, "6 6"]) -> Float[Array, "6"]:
+    """bᵀ F b for each column b of the basis."""
+    return jnp.sum(basis * (form @ basis), axis=0)
 
 
 def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions:

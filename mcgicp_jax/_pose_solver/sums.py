@@ -47,7 +47,7 @@ class Sums(NamedTuple):
         mass: Σ w h hᵀ without points near the sensor, as the following; None where observability is not known.
         observability: Σ w O ⊗ h hᵀ by the shape of the surfaces, less that of points near the sensor; None where it is
             not known.
-        common: the same by what both surfaces observe, in the last step; before it, `observability`.
+        common: Σ w O' ⊗ h hᵀ by the common O' of matched points, see `observability`.
         channel_observability: the same by the channels; None also where they are not used.
         agreement: the same by slopes of the channels that agree in both clouds; `channel_observability` where the
             slopes are not known, as before the last step.
@@ -175,15 +175,15 @@ def observability(
     channels are used, by channels; what both points have in common; and if the surfaces have `noise` with slopes, their
     agreement and its surplus.
 
-    What the O of both points by shape, A and B, have in common is their mean, less (|B| A + |A| B) / 2, and plus
-    (A B + B A) / 2: A where they are equal, B / 2 where A is unknown (0), and 0 for two certain normals at right
-    angles. At the end of a box of which one scan shows a face that the other does not, some points match across the
-    edge, and with the mean alone these constrained the slide along the box. Before the `last` sums, the mean stands for
-    it: far from the right pose, matches have nothing in common, and the directions that each cloud observes guide the
-    pose.
+    Let A and B be the O of the two points by shape; their traces, from 0 to 1, say how certain the normals are. Their
+    common O is (A + B) / 2 − (tr B · A + tr A · B) / 2 + (A B + B A) / 2. It is A where both are equal and of rank one,
+    B / 2 where the normal of A is unknown (A = 0), and 0 for two certain normals at right angles. Where one scan shows
+    the end of a box and the other does not, points match across the edge, and by the mean alone they constrained the
+    slide along the box. Before the `last` sums, the common O is the mean: far from the right pose, the normals of
+    matched points are unrelated, and the directions that each cloud observes guide the pose.
 
     The O of a cell is biased: its normal comes from few points, and is a random one where noise is as large as the
-    cell. Cells therefore have the product in common, whose noise is independent, less that of chance.
+    cell. The common O of cells is therefore the product of both, whose noise is independent, less that of chance.
     """
     source, target, rotation = posed.source, posed.target, posed.rotation
     if source.observability is None or target.observability is None:
@@ -191,8 +191,8 @@ def observability(
     ours, theirs = alg.rotate(rotation, source.observability.T), target.observability.T
     mean, common = 0.5 * (ours + theirs), alg.symmetric_product(ours, theirs)
     if all(term.matches_slide for term in terms):
-        sizes = [jnp.minimum(jnp.sqrt(alg.square_norm(one)), 1) for one in (theirs, ours)]
-        common = common + mean - 0.5 * (sizes[0] * ours + sizes[1] * theirs)
+        certain, certain_there = (jnp.clip(one[0] + one[3] + one[5], 0, 1) for one in (ours, theirs))
+        common = common + mean - 0.5 * (certain_there * ours + certain * theirs)
     else:
         common = common - _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
     fractions = {"observability": mean, "common": jnp.where(last, common, mean)}

@@ -221,9 +221,9 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
         run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
         if doubt and distance_moved(problem.start, run.loop.state) > settings.fine_distance:
-            # It was about another pose; where views have little in common, it holds of any.
-            matched = float(run.loop.state.sums.num_inliers) / max(np.sum(np.asarray(problem.source.search.valid)), 1)
-            doubt = doubt if matched < LITTLE_IN_COMMON else ""
+            # It was about another pose; where views have little in common, it is about this one, too.
+            overlap = surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop).overlap
+            doubt = doubt if overlap < LITTLE_IN_COMMON else ""
     if traced:
         return run
     status = run.loop.state.status
