@@ -250,8 +250,8 @@ def test_a_planar_scan_from_far_off(data, known, variance):
     right = 0
     for start in starts(truth, 20, 1.0, 20):
         result = mcg.register(*clouds, mcg.PointToPoint(), init=start, prior=prior, max_distance=(5, 0.2))
-        # Walls hardly tell the height. From three starts the first registration, before the prior is weighed, ends 1.3 m
-        # off and DEGENERATE, and the second one keeps what the first leaves unconstrained.
+        # Walls hardly tell the height. From three starts the first registration, before the prior is weighed, ends
+        # 1.3 m off and DEGENERATE. The second one does not move along what the first leaves unconstrained.
         is_right = near(result, truth, 0.05 if "z" in known else 0.1)
         assert is_right or not result.converged
         right += is_right
