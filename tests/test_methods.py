@@ -108,6 +108,25 @@ def test_the_floor_of_omega_rises_on_smooth_surfaces(roughness, expected):
     assert mcg.MultiChannelGICP(min_eigenvalue=0.2).resolve(cloud, cloud).min_eigenvalue == jnp.asarray(0.2)
 
 
+@in_both_precisions
+def test_epsilon_is_the_variance_along_the_normal_by_that_within_the_surface():
+    rng = np.random.default_rng(0)
+    points = np.pad(rng.random((2000, 2)), [(0, 0), (0, 1)])
+    points[:, 2] = 0.3 * median_spacing(points) * rng.normal(size=2000)
+    cloud = mcg.preprocess(mcg.PointCloud(points, rng.random(2000)), num_neighbors=20)
+    near = points[scipy.spatial.KDTree(points).query(points, 20)[1]]
+    offsets = near - near.mean(axis=1, keepdims=True)
+    smallest, *others = np.linalg.eigvalsh(offsets.swapaxes(1, 2) @ offsets).T
+    expected = np.median(smallest / np.mean(others, axis=0))
+    assert 2e-3 < expected < 0.1
+    # From samples.
+    np.testing.assert_allclose(chosen(cloud, cloud).epsilon, expected, rtol=0.05)
+    uniform = cloud.replace(channels=0 * np.asarray(cloud.channels))
+    np.testing.assert_allclose(chosen(uniform, uniform).epsilon, 1e-3)
+    assert mcg.MultiChannelGICP(0.3).resolve(cloud, cloud).epsilon is None
+    np.testing.assert_allclose(mcg.MultiChannelGICP(epsilon=2e-3).resolve(cloud, cloud).epsilon, 2e-3)
+
+
 def test_noise_is_that_of_the_points_that_have_the_channel():
     rng, clouds = np.random.default_rng(2), []
     for cloud in pair():

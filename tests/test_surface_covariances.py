@@ -289,7 +289,7 @@ def test_surfaces_are_the_same_block_by_block_and_inside_transformations():
 
 def numbers_for(source, target):
     method = MultiChannelGICP().resolve(source, target)
-    return method.channel_covariance, method.channel_weights, method.min_eigenvalue
+    return method.channel_covariance, method.channel_weights, method.epsilon, method.min_eigenvalue
 
 
 def test_chosen_numbers_are_the_same_inside_transformations():

@@ -43,13 +43,14 @@ _OTHER_LEVEL = 0.15
 
 def channel_noise(
     source: PointCloud, target: PointCloud, geometries: Geometries
-) -> tuple[Float[AnyArray, "C"], Bool[AnyArray, "C"], Float[AnyScalar, ""]]:
+) -> tuple[Float[AnyArray, "C"], Bool[AnyArray, "C"], Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     """Noise σ per channel, the median deviation from linear fits (1 for uniform channels), which channels are uniform,
-    and the median variance λ₀ along the normal, metres²; from samples of both clouds."""
+    the median variance λ₀ along the normal, metres², and the median of its ratio to the mean variance within the
+    surface (NaN if all neighbours coincide); from samples of both clouds."""
     samples = [_noise_rows(cloud) for cloud in (source, target)]
     local_geometries = constant(geometries((samples[0][0], samples[1][0])))
     xp = numpy_for(source, target, local_geometries)
-    residuals, values, sampled, across = [], [], [], []
+    residuals, values, sampled, across, ratios = [], [], [], [], []
     for cloud, local, (rows, counts) in zip((source, target), local_geometries, samples, strict=True):
         deviations = xp.sqrt(local.fits.residual.T)
         residuals.append(xp.where(counts[:-1], deviations, xp.nan))
@@ -59,7 +60,10 @@ def channel_noise(
         x, y, z = local.normal.T
         with np.errstate(over="ignore", invalid="ignore"):
             variance = xx * x * x + yy * y * y + zz * z * z + 2 * (xy * x * y + xz * x * z + yz * y * z)
+            inside = 0.5 * (xx + yy + zz - variance)
+            ratio = xp.where(inside > 0, variance / xp.where(inside > 0, inside, 1), xp.nan)
         across.append(xp.where(counts[-1], variance, xp.nan))
+        ratios.append(xp.where(counts[-1], ratio, xp.nan))
     sigma = median(xp.concatenate(residuals, axis=1))
     # The quantiles `_INNER`; NaN comes last.
     sample = xp.sort(xp.concatenate(sampled)[::_STRIDE], axis=0)
@@ -72,7 +76,8 @@ def channel_noise(
     largest = of_known(partial(xp.nanmax, axis=0), xp.abs(clipped))
     uniform = ~(spread > _ROUNDINGS * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
-    return xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread)), uniform, median(xp.concatenate(across))
+    sigma = xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread))
+    return sigma, uniform, median(xp.concatenate(across)), median(xp.concatenate(ratios))
 
 
 def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:

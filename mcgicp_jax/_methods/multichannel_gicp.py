@@ -35,8 +35,9 @@ from mcgicp_jax._terms.photometric import Photometric
 _SPREAD = 1.5
 # In spacings of the target: α σ, the position offset that weighs as much as one σ of a channel.
 _OFFSET_PER_SIGMA = 2.5
-# Floor of Ω's eigenvalues, relative to GICP's in-plane variance of 1: default, and least value chosen from the data.
-_MIN_EIGENVALUE = 5e-3
+# ε and floor of Ω's eigenvalues, relative to GICP's in-plane variance of 1: defaults, and least values chosen from the
+# data. ε is that of GICP.
+_EPSILON, _MIN_EIGENVALUE = 1e-3, 5e-3
 # Variance of a match along each tangent axis, spacing²: 1/(2 ln 2) for randomly placed points (Poisson process), whose
 # squared nearest-neighbour distance r² has the mean E and the median E ln 2.
 _MATCH_VARIANCE = 0.72
@@ -58,7 +59,7 @@ class MultiChannelGICP(base.AbstractGeneralized):
         channel_covariance: Λ of eq. 7, scalar or (C,) variances or (C, C), channel units²: the covariance of the
             difference between two measurements of one surface point. None: chosen from the data, see `resolve`.
         channel_weights: α, scalar or (C,), metres per channel unit. None: chosen from the data, see `resolve`.
-        epsilon: ε, as in `GICP`.
+        epsilon: ε, as in `GICP`. None: chosen along with Λ, see `resolve`; 0.001 if Λ is given.
         min_eigenvalue: floor of Ω's eigenvalues, reached where no neighbour has similar channels. Since the target is
             sampled, a match is less accurate within the surface than along the normal, whatever the channels. None:
             chosen along with Λ, see `resolve`; 0.005 if Λ is given.
@@ -76,7 +77,7 @@ class MultiChannelGICP(base.AbstractGeneralized):
 
     channel_covariance: Float[Array, "..."] | None
     channel_weights: Float[Array, "..."] | None
-    epsilon: Float[Array, ""]
+    epsilon: Float[Array, ""] | None
     min_eigenvalue: Float[Array, ""] | None
     photometric: bool = eqx.field(static=True)
 
@@ -84,7 +85,7 @@ class MultiChannelGICP(base.AbstractGeneralized):
         self,
         channel_covariance: Values | None = None,
         channel_weights: Values | None = None,
-        epsilon: ArrayLike = 1e-3,
+        epsilon: ArrayLike | None = None,
         min_eigenvalue: ArrayLike | None = None,
         photometric: bool = False,
     ):
@@ -92,7 +93,7 @@ class MultiChannelGICP(base.AbstractGeneralized):
         large enough for the precision, and the floor positive; or if a shape is wrong."""
         self.channel_covariance = None if channel_covariance is None else base.covariance_of(channel_covariance)
         self.channel_weights = None if channel_weights is None else base.weights_of(channel_weights)
-        self.epsilon = base.epsilon_of(epsilon)
+        self.epsilon = None if epsilon is None else base.epsilon_of(epsilon)
         self.min_eigenvalue = None if min_eigenvalue is None else positive_scalar("min_eigenvalue", min_eigenvalue)
         self.photometric = photometric
 
@@ -107,32 +108,39 @@ class MultiChannelGICP(base.AbstractGeneralized):
         spacings, the fine `max_distance`, so that channels choose among the points within it. The α of constant
         channels is 0.
 
+        ε is chosen if neither it nor Λ is given: the median over the points of λ₀/v, at least 0.001. λ₀ is the smallest
+        eigenvalue of a neighbourhood and v its mean variance within the surface, so this is the variance along the
+        normal in units of that within the surface, as ε should be. With a smaller ε, noise of the normals displaces the
+        points within the surface more than channels hold them. Of constant channels, ε is 0.001.
+
         The floor is chosen if neither it nor Λ is given. Between randomly placed points, a match has the variance 0.72
-        spacing² along each tangent axis, and 2 λ₀ along the normal, where λ₀ is the median smallest eigenvalue of the
-        neighbourhoods. The floor is ε times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the
-        curvature of the surface, the true ratio may be larger, so the estimate is used to raise the floor above 0.005
-        (as for rendered scenes), but not to lower it.
+        spacing² along each tangent axis, and 2 λ₀ along the normal, with the median λ₀. The floor is 0.001, or the
+        given ε, times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the curvature of the surface, the
+        true ratio may be larger, so the estimate is used to raise the floor above 0.005 (as for rendered scenes), but
+        not to lower it.
         """
         if self.channel_covariance is not None and self.channel_weights is not None:
             return self
         geometries = geometries or partial(local_geometries, source, target, True)
         # Not of the clouds, whose concrete arrays would be traced, too.
-        (sigma, uniform, across), spacing, epsilon = constant(
-            (channel_noise(source, target, geometries), point_spacing(target), self.epsilon)
+        (sigma, uniform, across, ratio), spacing, epsilon = constant(
+            (channel_noise(source, target, geometries), point_spacing(target), self._epsilon)
         )
         xp = numpy_for(source, target, sigma, across, epsilon)
         with np.errstate(over="ignore", invalid="ignore"):
             within = xp.asarray(epsilon, spacing.dtype) * _MATCH_VARIANCE * spacing**2
             smooth = ~(2 * across > within)
             floor = xp.where(smooth, 1, xp.maximum(within / xp.where(smooth, 1, 2 * across), _MIN_EIGENVALUE))
-            numbers = [2 * (_SPREAD * sigma) ** 2, xp.where(uniform, 0, _OFFSET_PER_SIGMA * spacing / sigma), floor]
-        covariance, weights, floor = (put_on_cpu(xp.asarray(number, epsilon.dtype)) for number in numbers)
-        if self.channel_covariance is not None or self.min_eigenvalue is not None:
-            floor = self.min_eigenvalue
+            thickness = xp.where(xp.all(uniform), epsilon, xp.fmax(epsilon, ratio))
+            weights = xp.where(uniform, 0, _OFFSET_PER_SIGMA * spacing / sigma)
+            numbers = [2 * (_SPREAD * sigma) ** 2, weights, thickness, floor]
+        covariance, weights, thickness, floor = (put_on_cpu(xp.asarray(number, epsilon.dtype)) for number in numbers)
+        if self.channel_covariance is not None:
+            thickness, floor = self.epsilon, self.min_eigenvalue
         resolved = eqx.tree_at(
-            lambda method: (method.channel_covariance, method.channel_weights, method.min_eigenvalue),
+            lambda method: (method.channel_covariance, method.channel_weights, method.epsilon, method.min_eigenvalue),
             self,
-            (covariance, weights, floor),
+            (covariance, weights, thickness, floor),
             is_leaf=lambda leaf: leaf is None,
         )
         return base.with_unset_from(self, resolved)
@@ -154,7 +162,7 @@ class MultiChannelGICP(base.AbstractGeneralized):
         if around.near is None:
             raise ValueError(NO_NEIGHBORS)
         local, dtype = base.known_geometry(local), around.own.dtype
-        epsilon, covariance = self.epsilon.astype(dtype), self._covariance_for(around.num_channels).astype(dtype)
+        epsilon, covariance = self._epsilon.astype(dtype), self._covariance_for(around.num_channels).astype(dtype)
         if around.num_channels == 0:
             return plane_covariance(local, epsilon)
         floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, dtype)
@@ -169,6 +177,10 @@ class MultiChannelGICP(base.AbstractGeneralized):
         covariance = self._covariance_for(num_channels)
         xp = numpy_for(covariance)
         return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
+
+    @property
+    def _epsilon(self) -> Float[Array, ""]:
+        return jnp.asarray(_EPSILON) if self.epsilon is None else self.epsilon
 
     def _covariance_for(self, count: int) -> Float[Array, "..."]:
         """Λ, which must be chosen and fit clouds of `count` channels."""
