@@ -605,6 +605,14 @@ def test_no_cloud(tmp_path, seeds, suffix):
         refuses(tmp_path / f"c{suffix}")
 
 
+@pytest.mark.parametrize(
+    "row, shown", [("1,2,hello,4", "4 numbers, got '1,2,hello,4'"), ("1,2,4", "4 numbers, got '1,2,4'")]
+)
+def test_a_line_that_is_no_row_is_named(tmp_path, row, shown):
+    (tmp_path / "c.csv").write_text(f"x,y,z,i\n1,2,3,4\n\n1,2,3,5\n{row}\n")
+    refuses(tmp_path / "c.csv", f"line 5: expected {shown}")
+
+
 @pytest.mark.parametrize("change", [("x y z", "x y"), ("4 4 4", "4 4 3"), ("F F F", "F F Q")])
 def test_a_damaged_pcd_header(tmp_path, change):
     content = pcd("x y z", "F41 F41 F41", b"1 2 3\n4 5 6")

@@ -21,12 +21,20 @@ _MOST_LINES = 1000
 
 def read_text(file: BinaryIO, size: int) -> PointCloud:
     with _as_text(file) as text:
-        names, line, cells = _text_start(text)
+        names, first, line, cells = _text_start(text)
         lines = plain_numbers(line + text.read())
     mark = _delimiter(line)
     if mark is not None:
         lines = re.sub(rf"^[ \t]*(?={mark})|(?<={mark})[ \t]*(?={mark}|$)", "nan", lines, flags=re.MULTILINE)
-    table = np.loadtxt(lines.splitlines(), delimiter=mark, ndmin=2)
+    try:
+        table = np.loadtxt(lines.splitlines(), delimiter=mark, ndmin=2)
+    except ValueError as error:
+        # NumPy counts rows from the first numbers, and some from 0.
+        for number, row in enumerate(lines.splitlines(), first):
+            plain = row.partition("#")[0].strip()
+            if plain and not _are_numbers(plain.split(mark), len(cells)):
+                raise ValueError(f"line {number}: expected {len(cells)} numbers, got {row.strip()[:60]!r}") from error
+        raise
     if not names and table.shape[1] < 3:
         raise ValueError(f"expected at least three columns, x, y and z, got {table.shape[1]}")
     names = names or ["x", "y", "z", *(f"channel_{i}" for i in range(table.shape[1] - 3))]
@@ -54,21 +62,28 @@ def is_text_cloud(file: BinaryIO) -> bool:
     """Whether the first lines are rows of coordinates, and not of poses, a log or another table."""
     with _as_text(file) as text:
         try:
-            names, line, cells = _text_start(text)
+            names, _, line, cells = _text_start(text)
         except ValueError:
             return False
         return len(cells) >= 3 and (bool(names) or not are_poses([line, *itertools.islice(text, _MOST_LINES)]))
 
 
-def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
-    """The column names, if their number is that of the columns, the first line of numbers, and its cells.
+def _are_numbers(cells: list[str], count: int) -> bool:
+    try:
+        return len([float(cell) for cell in cells]) == count
+    except ValueError:
+        return False
+
+
+def _text_start(text: io.TextIOWrapper) -> tuple[list[str], int, str, list[str]]:
+    """The column names, if their number is that of the columns; number, text and cells of the first line of numbers.
 
     A comment may have names after a colon. Units in brackets are no part of a name. A name that is missing, first, is
     that of the index of pandas or R. A first line with one number is that of the points.
     """
     names: list[str] = []
     commented = counted = False
-    for line in text:
+    for number, line in enumerate(text, 1):
         comment = line.startswith(("#", "//"))
         plain = plain_numbers(line).strip("#/ \t\r\n" if comment else " \t\r\n")
         cells = [cell.strip() for cell in plain.split(_delimiter(plain))]
@@ -84,7 +99,7 @@ def _text_start(text: io.TextIOWrapper) -> tuple[list[str], str, list[str]]:
                 names = ["index", *names]
             if len(names) != len(cells) and names and not commented:
                 raise ValueError(f"it names {len(names)} columns, and its rows have {len(cells)}")
-            return names if len(names) == len(cells) else [], line, cells
+            return names if len(names) == len(cells) else [], number, line, cells
         if comment:
             cells = cells[1 + max((i for i, cell in enumerate(cells) if cell.endswith(":")), default=-1) :]
         else:
