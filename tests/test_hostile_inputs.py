@@ -232,6 +232,18 @@ def test_points_in_one_place_do_not_set_the_default_distance(beams):
     assert result.converged and max(pose_error(result.matrix, truth)) < 1e-2
 
 
+def test_second_returns_do_not_set_the_default_distance():
+    """The spacing seemed to be the distance of the two returns, and the fine phase found no matches."""
+    *clouds, truth = pair(size=1000)
+    rng = np.random.default_rng(0)
+    source, target = (
+        np.concatenate([cloud.unpad().points, cloud.unpad().points + rng.normal(0, 1e-4, (1000, 3))])
+        for cloud in clouds
+    )
+    result = mcg.register(source, target, mcg.GICP())
+    assert result.converged and max(pose_error(result.matrix, truth)) < 1e-2
+
+
 def around(radius, count):
     """Places at a distance from the sensor, metres."""
     directions = np.random.default_rng(0).normal(size=(count, 3))

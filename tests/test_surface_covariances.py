@@ -307,7 +307,7 @@ def test_channels_without_noise_are_given_some():
     points, _ = ref.scene(700, seed=4)
     points[:, 2] = 0
     cloud = preprocess(PointCloud(points, points[:, 0]), num_neighbors=K)
-    covariance, weights, _ = numbers_for(cloud, cloud)
+    covariance, weights, *_ = numbers_for(cloud, cloud)
     np.testing.assert_allclose(covariance, 2 * (1.5e-3 * np.std(points[:, 0])) ** 2, rtol=1e-3)
     assert np.all(weights > 0)
 
