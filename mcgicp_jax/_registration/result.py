@@ -211,7 +211,7 @@ class RegistrationResult(eqx.Module):
         small rotation moves the points far and the first three variances are large: use `deviations` there.
 
         The estimate covers the noise and the sampling of the points, as checked on 504 simulated pairs: the squared
-        error is 0.5 to 1.4 times what it says (GICP, MC-GICP), 0.7 to 1.5 times with `photometric`; for `NDT` and
+        error is 0.4 to 1.4 times what it says (GICP, MC-GICP), 0.7 to 1.5 times with `photometric`; for `NDT` and
         `D2DNDT`, on the average of many scenes, 0.8 to 1.2 times, but 1.7 times for the few cells of a wall
         (`python -m tests.benchmarks.calibration`). It scatters: turning both clouds changes variances by 10 to 30 %,
         some by 75 %. It does not cover a wrong local minimum, errors common to all points (calibration, motion during a
