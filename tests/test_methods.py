@@ -54,7 +54,9 @@ def sigma(method):
 
 
 def median_spacing(points):
-    return np.median(scipy.spatial.KDTree(points).query(points, 2)[0][:, 1])
+    """Nearly coincident neighbours do not count."""
+    distances = scipy.spatial.KDTree(points).query(points, 20)[0]
+    return np.median(np.min(np.where(distances > distances[:, -1:] / 80, distances, np.inf), axis=1))
 
 
 def given_covariances():
