@@ -27,9 +27,13 @@ from mcgicp_jax._search.base import Correspondences
 _INNER, _STRIDE = (0.005, 0.995), 4
 # Smallest spread of a channel that is not uniform, in roundings of its largest value: what sums of constants leave.
 _ROUNDINGS = 10
-# A neighbour of k is nearly coincident if it is so many times k nearer than the k-th: an eighth of the spacing of
-# points along a line. Of randomly placed points, 0.3 % of the nearest neighbours are so near.
-_LEAST_DISTANCE = 4
+# Quantile of the neighbourhoods whose thickness is the noise of the surfaces: where there are edges, curvature and scan
+# lines, the flattest ones show it. On simulated streets with exact truth, the median gave errors of 11 instead of 7 mm;
+# on noisy walls and depth images both gave the same.
+_FLATTEST = 0.25
+# Neighbours are nearly coincident up to 1 / (4 k) of the distance of the k-th one, an eighth of the spacing of points
+# along a line. Of randomly placed points, 0.3 % have so near a neighbour.
+_NEARLY_COINCIDENT = 4
 # Quantiles (5 to 95 %) from which gain and offset are estimated: robust against parts that only one cloud sees.
 _QUANTILES = tuple(step / 20 for step in range(1, 20))
 # Ratio of the ranges of a channel in two clouds above which its units probably differ: files hold intensities from 0 to
@@ -48,8 +52,8 @@ def channel_noise(
     source: PointCloud, target: PointCloud, geometries: Geometries
 ) -> tuple[Float[AnyArray, "C"], Bool[AnyArray, "C"], Float[AnyScalar, ""], Float[AnyScalar, ""]]:
     """Noise σ per channel, the median deviation from linear fits (1 for uniform channels), which channels are uniform,
-    the median variance λ₀ along the normal, metres², and the median of its ratio to the mean variance within the
-    surface (NaN if all neighbours coincide); from samples of both clouds."""
+    the median variance λ₀ along the normal, metres², and the quantile `_FLATTEST` of its ratio to the mean variance
+    within the surface (NaN if all neighbours coincide); from samples of both clouds."""
     samples = [_noise_rows(cloud) for cloud in (source, target)]
     local_geometries = constant(geometries((samples[0][0], samples[1][0])))
     xp = numpy_for(source, target, local_geometries)
@@ -80,7 +84,8 @@ def channel_noise(
     uniform = ~(spread > _ROUNDINGS * xp.finfo(spread.dtype).eps * largest)
     # Rendered channels have no noise; a floor of a thousandth of their standard deviation keeps α finite and Λ regular.
     sigma = xp.where(uniform, 1, xp.fmax(sigma, 1e-3 * spread))
-    return sigma, uniform, median(xp.concatenate(across)), median(xp.concatenate(ratios))
+    ratio = of_known(partial(xp.nanquantile, q=_FLATTEST), xp.concatenate(ratios))
+    return sigma, uniform, median(xp.concatenate(across)), ratio
 
 
 def _noise_rows(cloud: PointCloud) -> tuple[Any, Any]:
@@ -141,7 +146,7 @@ def _spacings(cloud: PointCloud) -> tuple[Float[AnyScalar, ""], Float[AnyScalar,
     measured = xp.isfinite(squares)
     count = xp.sum(measured, axis=0)
     farthest = xp.max(xp.where(measured, squares, 0), axis=0)
-    near_duplicate = squares <= farthest / (_LEAST_DISTANCE * xp.maximum(count, 1).astype(squares.dtype)) ** 2
+    near_duplicate = squares <= farthest / (_NEARLY_COINCIDENT * xp.maximum(count, 1).astype(squares.dtype)) ** 2
     nearest = xp.sqrt(xp.min(xp.where(near_duplicate, xp.inf, squares), axis=0))
     spacing = xp.nan_to_num(median(xp.where(xp.isfinite(nearest), nearest, xp.nan)))
     grid = xp.sqrt(farthest) * xp.sqrt(xp.pi / xp.maximum(count, 1))

@@ -108,10 +108,10 @@ class MultiChannelGICP(base.AbstractGeneralized):
         spacings, the fine `max_distance`, so that channels choose among the points within it. The α of constant
         channels is 0.
 
-        ε is chosen if neither it nor Λ is given: the median over the points of λ₀/v, at least 0.001. λ₀ is the smallest
-        eigenvalue of a neighbourhood and v its mean variance within the surface, so this is the variance along the
-        normal in units of that within the surface, as ε should be. With a smaller ε, noise of the normals displaces the
-        points within the surface more than channels hold them. Of constant channels, ε is 0.001.
+        ε is chosen if neither it nor Λ is given: the 25 % quantile of λ₀/v, at least 0.001, for the smallest eigenvalue
+        λ₀ of a neighbourhood and its mean variance v within the surface. The flattest neighbourhoods show the noise
+        without edges and curvature. With a smaller ε, noise of the normals displaces the points within the surface more
+        than channels hold them. If all channels are constant, ε is 0.001.
 
         The floor is chosen if neither it nor Λ is given. Between randomly placed points, a match has the variance 0.72
         spacing² along each tangent axis, and 2 λ₀ along the normal, with the median λ₀. The floor is 0.001, or the

@@ -29,7 +29,7 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
     try:
         table = np.loadtxt(lines.splitlines(), delimiter=mark, ndmin=2)
     except ValueError as error:
-        # NumPy counts rows from the first numbers, and some from 0.
+        # Its row number is not that of the line in the file.
         for number, row in enumerate(lines.splitlines(), first):
             plain = row.partition("#")[0].strip()
             if plain and not _are_numbers(plain.split(mark), len(cells)):
