@@ -54,7 +54,7 @@ class AbstractKernel(Numbers):
     Attributes:
         scale: k, the Mahalanobis distance at which weights fall (`Huber`: beyond it). Covariances of GICP are
             dimensionless, 1 within the surface and ε = 0.001 across it: k = 1 is 1.4 m within the surface, but 4.5 cm
-            across it.
+            across it, and √(2 ε) m with the larger ε that `MultiChannelGICP` chooses on noisy surfaces.
     """
 
     scale: Float[Array, ""]
