@@ -63,7 +63,8 @@ _KERNEL = tyro.constructors.PrimitiveConstructorSpec[tuple[str, float] | None](
     is_instance=lambda value: value is None or isinstance(value, tuple),
     str_from_instance=lambda value: [str(value)],
 )
-_EPSILON = f"{inspect.signature(mcg.GICP).parameters['epsilon'].default}; with channels, from the noise of the surfaces"
+_DEFAULT = inspect.signature(mcg.GICP).parameters["epsilon"].default
+_EPSILON = f"{_DEFAULT}; mc-gicp: from the noise, unless --channel-covariance is given"
 # Suffixes of clouds that are not text; a text file, such as poses, has none of these.
 _BINARY = {suffix for suffix, cloud_format in FORMATS.items() if cloud_format.read is not read_text}
 # Largest number of files that a message lists.

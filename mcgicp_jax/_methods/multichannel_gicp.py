@@ -59,7 +59,7 @@ class MultiChannelGICP(base.AbstractGeneralized):
         channel_covariance: Λ of eq. 7, scalar or (C,) variances or (C, C), channel units²: the covariance of the
             difference between two measurements of one surface point. None: chosen from the data, see `resolve`.
         channel_weights: α, scalar or (C,), metres per channel unit. None: chosen from the data, see `resolve`.
-        epsilon: ε, as in `GICP`. None: chosen along with Λ, see `resolve`; 0.001 if Λ is given.
+        epsilon: ε, as in `GICP`. None: chosen from the noise of the surfaces, see `resolve`; 0.001 if Λ is given.
         min_eigenvalue: floor of Ω's eigenvalues, reached where no neighbour has similar channels. Since the target is
             sampled, a match is less accurate within the surface than along the normal, whatever the channels. None:
             chosen along with Λ, see `resolve`; 0.005 if Λ is given.
@@ -108,16 +108,16 @@ class MultiChannelGICP(base.AbstractGeneralized):
         spacings, the fine `max_distance`, so that channels choose among the points within it. The α of constant
         channels is 0.
 
-        ε is chosen if neither it nor Λ is given: the 25 % quantile of λ₀/v, at least 0.001, for the smallest eigenvalue
-        λ₀ of a neighbourhood and its mean variance v within the surface. The flattest neighbourhoods show the noise
+        ε is chosen if neither it nor Λ is given: the 25 % quantile over neighbourhoods of λ₀/v, at least 0.001. λ₀ is
+        the smallest eigenvalue, and v the mean variance within the surface. The flattest neighbourhoods show the noise
         without edges and curvature. With a smaller ε, noise of the normals displaces the points within the surface more
         than channels hold them. If all channels are constant, ε is 0.001.
 
         The floor is chosen if neither it nor Λ is given. Between randomly placed points, a match has the variance 0.72
         spacing² along each tangent axis, and 2 λ₀ along the normal, with the median λ₀. The floor is 0.001, or the
-        given ε, times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the curvature of the surface, the
-        true ratio may be larger, so the estimate is used to raise the floor above 0.005 (as for rendered scenes), but
-        not to lower it.
+        given (not the chosen) ε, times the ratio of the two, limited to 0.005 to 1. As λ₀ includes the curvature of the
+        surface, the true ratio may be larger, so the estimate is used to raise the floor above 0.005 (as for rendered
+        scenes), but not to lower it.
         """
         if self.channel_covariance is not None and self.channel_weights is not None:
             return self

@@ -75,7 +75,7 @@ _ADVICE = {
     Status.TOO_FEW_CORRESPONDENCES: "fewer than four points have a match; "
     "are both clouds in metres? If so, they need an initial pose at which they overlap; a global search may find one",
     Status.DEGENERATE: "the pose is unconstrained in at least one direction; try clouds that show more of the scene, "
-    "or MC-GICP with channels that vary along it, or fix that direction if the initial pose is right in it",
+    "channels that vary along it (MC-GICP), or fix that direction if the initial pose is right in it",
     Status.NON_FINITE: "numerical overflow; are the coordinates in metres?",
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
