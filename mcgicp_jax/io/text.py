@@ -32,7 +32,11 @@ def read_text(file: BinaryIO, size: int) -> PointCloud:
         # Its row number is not that of the line in the file.
         for number, row in enumerate(lines.splitlines(), first):
             plain = row.partition("#")[0].strip()
-            if plain and not _are_numbers(plain.split(mark), len(cells)):
+            try:
+                count = len([float(cell) for cell in plain.split(mark)])
+            except ValueError:
+                count = 0
+            if plain and count != len(cells):
                 raise ValueError(f"line {number}: expected {len(cells)} numbers, got {row.strip()[:60]!r}") from error
         raise
     if not names and table.shape[1] < 3:
@@ -66,13 +70,6 @@ def is_text_cloud(file: BinaryIO) -> bool:
         except ValueError:
             return False
         return len(cells) >= 3 and (bool(names) or not are_poses([line, *itertools.islice(text, _MOST_LINES)]))
-
-
-def _are_numbers(cells: list[str], count: int) -> bool:
-    try:
-        return len([float(cell) for cell in cells]) == count
-    except ValueError:
-        return False
 
 
 def _text_start(text: io.TextIOWrapper) -> tuple[list[str], int, str, list[str]]:
