@@ -75,7 +75,7 @@ def median(values: Any) -> Any:
     return jnp.sum(0.5 * jnp.take_along_axis(ordered, middle, axis=-1), axis=-1)
 
 
-def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n C"]) -> Float[AnyArray, "*some C"]:
+def of_known(statistic: Callable[[Any], Any], values: Float[AnyArray, "n *C"]) -> Float[AnyArray, "..."]:
     """A statistic over the first axis that ignores NaN, such as `nanstd`; NaN for columns of NaN."""
     xp = numpy_for(values)
     # NumPy would warn of columns of NaN, and its warning cannot be suppressed in one thread alone.
