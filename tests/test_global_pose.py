@@ -17,6 +17,7 @@ from mcgicp_jax.__main__ import main
 from mcgicp_jax._global_pose import features
 from mcgicp_jax._global_pose.global_pose import Candidate
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches, _support, fit_pose, hypotheses
+from mcgicp_jax.datasets._raycast import Box, Cylinder, cast
 from mcgicp_jax.metrics import pose_error
 from tests.compilations import compilations
 from tests.promise_scenes import NOISE, office, rects
@@ -341,6 +342,15 @@ def test_a_pose_with_as_much_support_is_a_rival():
     assert right.rivals(wrong) and not replace(right, support=1.0).rivals(wrong)
 
 
+def test_a_pose_with_fewer_points_in_free_space_is_a_rival():
+    wrong = Candidate(np.eye(4), num_inliers=60, overlap=0.87, agreement=0.8, support=8.0, in_free_space=0.008)
+    right = Candidate(np.eye(4), num_inliers=1, overlap=0.7, agreement=0.2, support=0.1, in_free_space=0.0004)
+    assert right.rivals(wrong)
+    for change in ({"in_free_space": 0.002}, {"overlap": 0.3}, {"agreement": 0.05}):
+        assert not replace(right, **change).rivals(wrong)
+    assert not right.rivals(replace(wrong, in_free_space=0.002))
+
+
 def bays(seed, number=3, period=2.0):
     """Equal bays in front of a wall."""
     rng, length = np.random.default_rng(seed), number * period
@@ -349,6 +359,46 @@ def bays(seed, number=3, period=2.0):
         sides += furniture((x + 0.3, 2.2, 0), (x + 1, 3, 1.1)) + furniture((x + 1.3, 1, 0), (x + 1.6, 1.3, 2))
         sides += furniture((x + 0.2, 0.4, 0), (x + 0.5, 1.2, 0.5))
     return mcg.PointCloud(rects(rng, 8000, sides) + NOISE * rng.normal(size=(8000, 3)))
+
+
+def hall(seed):
+    """Scans from two corners of a hall with boxes and pillars, which is the same after half a turn but for those."""
+    rng = np.random.default_rng(seed)
+    solids = [
+        Box(np.array(low, float), np.array(high, float))
+        for low, high in (
+            ((-16, -11, -1), (16, 11, 0)),
+            ((-16, -11, 6), (16, 11, 7)),
+            ((-16, -11, 0), (-15, 11, 6)),
+            ((15, -11, 0), (16, 11, 6)),
+            ((-15, -11, 0), (15, -10, 6)),
+            ((-15, 10, 0), (15, 11, 6)),
+        )
+    ]
+    stations = np.array([[-11, -7, 1.6], [10, 7, 1.6]])
+    while len(solids) < 24:
+        corner = np.append(rng.uniform((-13, -8), (13, 8)), 0)
+        if np.linalg.norm(corner - stations, axis=1).min() < 4:
+            continue
+        size = rng.uniform((0.3, 0.3, 0.5), (2.5, 2.5, 3))
+        solids.append(Box(corner, corner + size) if len(solids) < 18 else Cylinder(corner, 0.1 * size[2], 6.0))
+    elevation, azimuth = np.meshgrid(np.radians(np.linspace(-60, 85, 150)), np.arange(0, 2 * np.pi, np.pi / 180))
+    rays = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1).reshape(-1, 3)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    poses, clouds = [np.eye(4), np.eye(4)], []
+    for pose, station in zip(poses, stations, strict=True):
+        pose[:3, :3] = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)).as_matrix()
+        pose[:3, 3] = station
+        hits = cast(pose, rays, solids, 80.0)
+        clouds.append(hits.sensor_rays * (hits.distance + 0.003 * rng.normal(size=len(hits.distance)))[:, None])
+    return clouds[1], clouds[0], np.linalg.inv(poses[0]) @ poses[1]
+
+
+def test_a_hall_is_not_turned_where_furniture_would_stand_in_free_space():
+    """From the opposite corner furniture looks different, and features find the pose alone that is half a turn off."""
+    source, target, truth = hall(seed=0)
+    result = mcg.global_pose(source, target)
+    assert result.ambiguous and found(result.runner_up, truth, mcg.PointCloud(source))
 
 
 def test_overlap_decides_where_a_scene_repeats():
