@@ -29,6 +29,26 @@ def test_a_start_from_trusted_loops_is_near_the_minimum():
     assert found.num_iterations < odometry.num_iterations and odometry.cost > 1.1 * found.cost
 
 
+@pytest.mark.parametrize(("right", "others", "trusted"), [(4, 3, False), (6, 3, True), (1, 0, True)])
+def test_loops_that_alone_connect_two_parts_are_trusted_if_most_agree(right, others, trusted):
+    """Wrong loops between places that look alike agree with each other, too."""
+    rng = np.random.default_rng(0)
+    truth, _ = grid(2)
+    chain = [(k, k + 1) for k in range(len(truth) - 1)]
+    loops = [(k % 4, 4 + k // 2 % 4) for k in range(right + others)]
+    i, j = np.array(chain + loops).T
+    motions = moved(np.linalg.inv(truth[i]) @ truth[j], 1e-3 * rng.normal(size=(len(i), 6)))
+    motions[len(motions) - others :] @= motion((5, 3, 0, 0, 0, 1))
+    motions[len(motions) - others :, :3, 3] += rng.normal(size=(others, 3))
+    information = np.tile(1e6 * np.eye(6), (len(i), 1, 1))
+    # The motion from pose 3 to pose 4 is assumed, as after a lost frame.
+    information[3] = 0
+    edges = mcg.Edge(i, j, motions, information, uncertain=np.arange(len(i)) >= len(chain))
+    found = mcg.optimize_poses(mcg.PoseGraph(truth, edges))
+    assert found.status is (mcg.Status.CONVERGED if trusted else mcg.Status.DEGENERATE)
+    assert found.kept[len(chain) :].sum() == right
+
+
 def test_rejected_loops_leave_no_trace():
     graph, _ = measured(*grid(2), false=0.3)
     found = mcg.optimize_poses(graph)
