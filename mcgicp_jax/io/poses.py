@@ -138,8 +138,9 @@ def read_g2o(path: str | os.PathLike[str]) -> PoseGraph:
         of_world = np.arange(len(values)) >= len(edges)
         loop = ~of_world & (np.abs(ends[:, 0] - ends[:, 1]) != 1)
         i = np.where(of_world, WORLD, rows[:, 0])
-        motions = _poses(values[:, 2:9])
-        return PoseGraph(_poses(vertices[first, 1:]), Edge(i, rows[:, 1], motions, information, uncertain=loop))
+        # x y z qx qy qz qw, with quaternions of any norm.
+        poses, motions = (matrices_of(p[:, [6, 3, 4, 5, 0, 1, 2]]) for p in (vertices[first, 1:], values[:, 2:9]))
+        return PoseGraph(poses, Edge(i, rows[:, 1], motions, information, uncertain=loop))
 
 
 def write_g2o(path: str | os.PathLike[str], graph: PoseGraph | Any) -> None:
@@ -190,8 +191,3 @@ def _rows(lines: list[tuple[int, list[str]]], tag: str) -> tuple[list[int], Floa
             line_numbers.append(line)
             rows.append(row)
     return line_numbers, np.array(rows).reshape(-1, width)
-
-
-def _poses(rows: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 4 4"]:
-    """Poses from x y z qx qy qz qw, with quaternions of any norm."""
-    return matrices_of(rows[:, [6, 3, 4, 5, 0, 1, 2]])
