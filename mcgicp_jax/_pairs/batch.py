@@ -10,7 +10,6 @@ import jaxlie
 import numpy as np
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
@@ -18,7 +17,7 @@ from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.batch_executors import GivenExecutor, executor_of, run, run_differentiated
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
-from mcgicp_jax._registration.options import GivenOptions, check_method, options_of
+from mcgicp_jax._registration.options import GivenOptions, options_of
 from mcgicp_jax._registration.result import RegistrationResult
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior
 
@@ -47,8 +46,8 @@ def register_batch(
     the poses of many pairs is one call; with an `executor` by its workers, as (7, n) matrices. Clouds and priors must
     be given in lists then. Inside `jit` and `vmap`, use `register`.
     """
-    has_priors = priors is not None
-    job = _job(method, options, voxel_size, num_neighbors, covariances, has_priors)
+    given = options_of(register_batch, options)
+    job = BatchJob(method, given, voxel_size, num_neighbors, covariances, priors is not None)
     workers, (pairs, count) = executor_of(executor), _pairs(job, sources, targets, init, priors)
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
@@ -122,26 +121,11 @@ def register_as_completed(
         PairWarning: the reason for each pair with the status `INVALID_INPUT`, `WORKER_FAILED` or `UNVERIFIED`, or for
             which `global_pose` finds no pose; a `UserWarning`.
     """
-    job = _job(method, options, voxel_size, num_neighbors, covariances, priors is not None)
+    given = options_of(register_batch, options)
+    job = BatchJob(method, given, voxel_size, num_neighbors, covariances, priors is not None)
     workers = executor_of(executor)
     pairs, count = _pairs(job, sources, targets, init, priors)
     return run(job, pairs, workers, count)
-
-
-def _job(
-    method: AbstractMethod,
-    given: GivenOptions,
-    voxel_size: VoxelSize,
-    num_neighbors: int,
-    covariances: bool,
-    has_priors: bool,
-) -> BatchJob:
-    check_method(method)
-    check_preprocessing(voxel_size, num_neighbors)
-    options = options_of(register_batch, given)
-    if has_priors and not options.hold_unconstrained:
-        raise ValueError("hold_unconstrained: expected True with priors, got False")
-    return BatchJob(method, options, voxel_size, num_neighbors, covariances, has_priors)
 
 
 def _pairs(
@@ -157,8 +141,12 @@ def _pairs(
     sides: dict[str, Any] = {"sources": sources, "targets": targets, "init": init, "priors": priors}
     num_dimensions = init.wxyz_xyz.ndim + 1 if isinstance(init, jaxlie.SE3) else getattr(init, "ndim", None)
     is_one_pose = init is None or isinstance(init, str) or num_dimensions == 2
-    common = {"sources": _is_one_cloud(sources), "targets": _is_one_cloud(targets)}
-    common |= {"init": is_one_pose, "priors": priors is None}
+    common = {"init": is_one_pose, "priors": priors is None}
+    for name in ("sources", "targets"):
+        side = sides[name]
+        structured = getattr(getattr(side, "dtype", None), "names", None) is not None
+        flat = structured or getattr(side, "ndim", None) == 2
+        common[name] = isinstance(side, PointCloud) or callable(side) or flat
     if common["sources"] and common["targets"]:
         raise ValueError("sources: expected several clouds on at least one side, got one on each; call register")
     for name, value in sides.items():
@@ -167,7 +155,7 @@ def _pairs(
                 (value,) = job.ready({name: value})
             elif name == "init" and value is not None and not isinstance(value, str):
                 value = pose_matrix(value)
-            sides[name] = itertools.repeat(value)
+            sides[name] = value
         elif isinstance(value, jaxlie.SE3):
             sides[name] = np.asarray(matrix_of(value))
         elif not isinstance(value, Iterable):
@@ -177,23 +165,14 @@ def _pairs(
     if len(set(sizes.values())) > 1:
         counts = ", ".join(f"{count} {name}" for name, count in sizes.items())
         raise ValueError(f"{next(iter(sizes))}: expected one per pair, got {counts}")
-    return _zip_pairs(sides, several), next(iter(sizes.values()), None)
 
+    def pairs() -> Iterator[Pair]:
+        end: Any = object()
+        iterables = [sides[name] for name in several]
+        for index, values in enumerate(itertools.zip_longest(*iterables, fillvalue=end)):
+            ended = [name for name, value in zip(several, values, strict=True) if value is end]
+            if ended:
+                raise ValueError(f"{ended[0]}: expected one per pair, got {index}, fewer than on the other side")
+            yield Pair(index, *(sides | dict(zip(several, values, strict=True))).values())
 
-def _zip_pairs(sides: dict[str, Any], several: list[str]) -> Iterator[Pair]:
-    iterators, end = {name: iter(values) for name, values in sides.items()}, object()
-    for index in itertools.count():
-        values: dict[str, Any] = {name: next(iterator, end) for name, iterator in iterators.items()}
-        ended = [name for name in several if values[name] is end]
-        if len(ended) == len(several):
-            return
-        if ended:
-            raise ValueError(f"{ended[0]}: expected one per pair, got {index}, fewer than on the other side")
-        yield Pair(index, *values.values())
-
-
-def _is_one_cloud(value: object) -> bool:
-    if isinstance(value, PointCloud):
-        return True
-    structured = getattr(getattr(value, "dtype", None), "names", None) is not None
-    return callable(value) or structured or getattr(value, "ndim", None) == 2
+    return pairs(), next(iter(sizes.values()), None)

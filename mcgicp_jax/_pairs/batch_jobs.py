@@ -18,6 +18,7 @@ import numpy as np
 
 from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
+from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._clouds.voxel_size import VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.devices import computed_on_cpu, on_accelerator
@@ -27,7 +28,7 @@ from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, 
 from mcgicp_jax._local_geometry.sensor_patterns import doubt_of_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.register import coarse_distance_from, doubt_of, doubt_of_start_pose, start_from_anywhere
+from mcgicp_jax._pairs.register import doubt_of, doubt_of_start_pose, start_from_anywhere
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.chunks import ChunkPair, Refused, run_pairs
 from mcgicp_jax._registration.input_checks import (
@@ -37,7 +38,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_lengths,
 )
 from mcgicp_jax._registration.on_host import HostExecutor
-from mcgicp_jax._registration.options import Options
+from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, parameters_by
 from mcgicp_jax._registration.register_pair import (
     Run,
@@ -171,6 +172,12 @@ class BatchJob:
     has_priors: bool = False
     checked: bool = True
 
+    def __post_init__(self) -> None:
+        check_method(self.method)
+        check_preprocessing(self.voxel_size, self.num_neighbors)
+        if self.has_priors and not self.options.hold_unconstrained:
+            raise ValueError("hold_unconstrained: expected True with priors, got False")
+
     @property
     def _options(self) -> Options:
         """The options, with the default search outside of chunks."""
@@ -201,8 +208,8 @@ class BatchJob:
         if not isinstance(pair.init, str):
             init = pair.prior[0] if pair.init is None and pair.prior is not None else pair.init
             return PreparedPair(pair.index, inputs, primal(init), pair.prior)
-        start = start_from_anywhere(pair.init, primal(source), primal(target))
-        distance, doubt = coarse_distance_from(start, options), doubt_of_start_pose(start)
+        start, distance = start_from_anywhere(pair.init, primal(source), primal(target), options)
+        doubt = doubt_of_start_pose(start)
         if not start.num_inliers:
             return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES), doubt)
         return PreparedPair(pair.index, inputs, start.matrix, pair.prior, doubt, distance)
@@ -211,9 +218,6 @@ class BatchJob:
     def register_chunk(self, chunk: list[Pair]) -> list[PairResult]:
         """Register the pairs one after the other, on the CPU: workers would compete for an accelerator."""
         return [self._register_with_jacobian(pair) if pair.traced else self._register(pair) for pair in chunk]
-
-    def received(self, pair: Pair) -> None:
-        """Nothing: that this job and the pair could be sent to a worker is all that is asked."""
 
     def register_chunk_alone(self, chunk: list[Pair]) -> list[PairResult]:
         """`register_chunk` in a process without other threads; the first result has the warnings."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from functools import partial
 from multiprocessing import resource_tracker
@@ -60,14 +59,19 @@ class Processes(Executor):
         resource_tracker.ensure_running()
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        # loky starts workers here, and later one for each that has died.
-        with _without_interrupt():
-            try:
-                future = self._pool.submit(function, *arguments, **named)
-            except RuntimeError:
-                # A worker died, or another batch that ended early has ended the workers.
-                self._pool = self._current()
-                future = self._pool.submit(function, *arguments, **named)
+        # loky starts workers here, and later one for each that has died. Processes that start while Ctrl-C waits never
+        # get it, so they do not report it either. Windows has no such mask.
+        set_mask: Any = getattr(signal, "pthread_sigmask", None)
+        before = set_mask and set_mask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            future = self._pool.submit(function, *arguments, **named)
+        except RuntimeError:
+            # A worker died, or another batch that ended early has ended the workers.
+            self._pool = self._current()
+            future = self._pool.submit(function, *arguments, **named)
+        finally:
+            if set_mask:
+                set_mask(signal.SIG_SETMASK, before)
         self._unfinished[future] = self
         future.add_done_callback(self._unfinished.pop)
         return future
@@ -85,20 +89,6 @@ class Processes(Executor):
         for future, batch in unfinished.items():
             if batch is self:
                 future.cancel()
-
-
-@contextlib.contextmanager
-def _without_interrupt() -> Iterator[None]:
-    """Context in which Ctrl-C waits. Processes that start in it never get it, so they do not report it either."""
-    if not hasattr(signal, "pthread_sigmask"):
-        # On Windows.
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker(parent: int) -> None:

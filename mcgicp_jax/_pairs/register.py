@@ -156,13 +156,13 @@ def register(
     trusted = True
     pose: Any = init
     if isinstance(init, str):
-        start = start_from_anywhere(init, primal(source), primal(target))
+        start, distance = start_from_anywhere(init, primal(source), primal(target), options)
         pose, trusted = start.matrix, start.success
         if not trusted:
             warn(doubt_of_start_pose(start))
         if not start.num_inliers:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
-        options = replace(options, max_coarse_distance=coarse_distance_from(start, options))
+        options = replace(options, max_coarse_distance=distance)
     result = verified(register_pair(source, target, method, pose, options, tie_points, prior), trusted)
     doubt = doubt_of(result)
     if doubt:
@@ -183,11 +183,6 @@ def doubt_of_start_pose(start: GlobalPoseResult) -> str:
     return f"global pose: too little evidence ({evidence}), so that it is UNVERIFIED"
 
 
-def coarse_distance_from(start: GlobalPoseResult, options: Options) -> float:
-    """Largest coarse `max_distance` from a pose of `global_pose`, metres."""
-    return start.voxel_size if start.success and options.max_distance is None else np.inf
-
-
 def doubt_of(result: RegistrationResult) -> str | None:
     """Why a pose is probably wrong; None if it is no result of matches, or they do not speak against it."""
     if not is_concrete(result.overlap, result.status_code):
@@ -198,10 +193,14 @@ def doubt_of(result: RegistrationResult) -> str | None:
     return f"only {100 * overlap:.2g} % of the source points have a match, so the pose is probably wrong"
 
 
-def start_from_anywhere(init: str, source: PointCloud | Values, target: PointCloud | Values) -> GlobalPoseResult:
-    """The initial pose of a registration with `init="global"`; without inliers, none was found."""
+def start_from_anywhere(
+    init: str, source: PointCloud | Values, target: PointCloud | Values, options: Options
+) -> tuple[GlobalPoseResult, float]:
+    """The initial pose of a registration with `init="global"`, none if it has no inliers, and the largest coarse
+    `max_distance` from it, metres."""
     if init != "global":
         raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
     if not is_concrete(source, target):
         raise ValueError('init: expected a pose inside transformations, got "global"')
-    return global_pose(source, target)
+    start = global_pose(source, target)
+    return start, start.voxel_size if start.success and options.max_distance is None else np.inf
