@@ -127,24 +127,13 @@ def _results(job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, cou
         yield from _by_threads_then_processes(job, pairs, count)
     elif executor == "threads":
         yield from _by_threads(job, pairs)
-    elif isinstance(executor, Processes):
-        yield from _by_processes(job, pairs, executor)
     else:
-        chunk_size = 1 if isinstance(executor, ThreadPoolExecutor) else _CHUNK_SIZE
-        yield from ChunkedExecutor(job, executor).run(pairs, chunk_size, _MAX_SUBMITTED)
+        yield from ChunkedExecutor(job, executor).run(pairs)
 
 
 def _by_threads(job: BatchJob, pairs: Iterator[Pair]) -> Iterator[PairResult]:
     with ThreadPoolExecutor(num_cores(), thread_name_prefix="mcgicp") as threads:
-        yield from ChunkedExecutor(job, threads).run(pairs, 1, 2 * num_cores())
-
-
-def _by_processes(
-    job: BatchJob, pairs: Iterator[Pair], processes: Processes, at_home: bool = False
-) -> Iterator[PairResult]:
-    # More than loky's queue holds, so that no worker waits.
-    yield from ChunkedExecutor(job, processes, at_home).run(pairs, _SMALL_CHUNK, 4 * processes.num_workers)
-    Processes.are_warm = True
+        yield from ChunkedExecutor(job, threads, max_submitted=2 * num_cores()).run(pairs)
 
 
 def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int | None) -> Iterator[PairResult]:
@@ -175,7 +164,7 @@ def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int 
         if rest is None and start.processes is not None:
             start.processes.shutdown(cancel_futures=True)
     if rest is not None and start.processes is not None:
-        yield from _by_processes(job, rest, start.processes, at_home=True)
+        yield from ChunkedExecutor(job, start.processes, at_home=True).run(rest)
 
 
 class _Start:
@@ -248,27 +237,33 @@ class ChunkedExecutor:
     `at_home`: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
     """
 
-    def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False):
+    def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False, max_submitted: int = _MAX_SUBMITTED):
         self._executor, self._at_home = executor, job if at_home else None
         self._replacement: Executor | None = None
         self._pickled = not isinstance(executor, ThreadPoolExecutor)
+        self._chunk_size, self._max_submitted = _CHUNK_SIZE if self._pickled else 1, max_submitted
+        if isinstance(executor, Processes):
+            # More submitted chunks than loky's queue holds, so that no worker waits.
+            self._chunk_size, self._max_submitted = _SMALL_CHUNK, 4 * executor.num_workers
         job = _as_numpy(job) if self._pickled else job
         work = job.register_chunk_alone if isinstance(executor, Processes) else job.register_chunk
         self._register = with_settings(work, pickled=self._pickled)
         self._suspects: collections.deque[Pair] = collections.deque()
         self._submitted: dict[Future[list[PairResult]], list[Pair]] = {}
 
-    def run(self, pairs: Iterator[Pair], chunk_size: int, max_submitted: int) -> Iterator[PairResult]:
+    def run(self, pairs: Iterator[Pair]) -> Iterator[PairResult]:
         try:
-            while chunk := list(itertools.islice(pairs, chunk_size)):
+            while chunk := list(itertools.islice(pairs, self._chunk_size)):
                 self._submit(chunk)
-                while len(self._submitted) >= max_submitted:
+                while len(self._submitted) >= self._max_submitted:
                     yield from self._receive()
             while self._submitted:
                 yield from self._receive()
             while self._suspects:
                 self._submit([self._suspects.popleft()])
                 yield from self._receive(last_try=True)
+            if isinstance(self._executor, Processes):
+                Processes.are_warm = True
         finally:
             if isinstance(self._executor, Processes):
                 self._executor.shutdown(cancel_futures=bool(self._submitted))
