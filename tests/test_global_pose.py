@@ -510,13 +510,15 @@ def test_a_global_pose_that_is_unsure_leaves_the_registration_unverified():
 @pytest.mark.slow
 @pytest.mark.parametrize("sure", [True, False])
 def test_a_worker_that_differentiates_knows_how_sure_the_start_is(sure):
-    """A sure start limits the coarse `max_distance`, and of one that is not, a warning tells."""
+    """A sure start limits the coarse `max_distance`, and of one that is not, a warning tells, traced or not."""
     ours = office(1, 4000)
     source, target = (ours.source, ours.target) if sure else map(mcg.preprocess, strangers(1000))
 
     def registered(points, executor):
         options = {"init": "global", "executor": executor}
-        (result,) = mcg.register_batch([source.replace(points=points)], [target], mcg.GICP(), **options)
+        sources = source.replace(points=points), source
+        result, untraced = mcg.register_batch(sources, [target] * 2, mcg.GICP(), **options)
+        assert (untraced.status is mcg.Status.UNVERIFIED) != sure
         return result
 
     def poses(executor):

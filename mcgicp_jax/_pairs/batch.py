@@ -46,8 +46,8 @@ def register_batch(
     the poses of many pairs is one call; with an `executor` by its workers, as (7, n) matrices. Clouds and priors must
     be given in lists then. Inside `jit` and `vmap`, use `register`.
     """
-    given = options_of(register_batch, options)
-    job = BatchJob(method, given, voxel_size, num_neighbors, covariances, priors is not None)
+    checked_options = options_of(register_batch, options)
+    job = BatchJob(method, checked_options, voxel_size, num_neighbors, covariances, priors is not None)
     workers, (pairs, count) = executor_of(executor), _pairs(job, sources, targets, init, priors)
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
@@ -121,8 +121,8 @@ def register_as_completed(
         PairWarning: the reason for each pair with the status `INVALID_INPUT`, `WORKER_FAILED` or `UNVERIFIED`, or for
             which `global_pose` finds no pose; a `UserWarning`.
     """
-    given = options_of(register_batch, options)
-    job = BatchJob(method, given, voxel_size, num_neighbors, covariances, priors is not None)
+    checked_options = options_of(register_batch, options)
+    job = BatchJob(method, checked_options, voxel_size, num_neighbors, covariances, priors is not None)
     workers = executor_of(executor)
     pairs, count = _pairs(job, sources, targets, init, priors)
     return run(job, pairs, workers, count)

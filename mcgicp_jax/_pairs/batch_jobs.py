@@ -229,7 +229,11 @@ class BatchJob:
     @_of_a_pair
     def _register(self, pair: Pair) -> PairResult:
         ready = self.prepare(pair)
-        return ready if isinstance(ready, PairResult) else self._register_prepared(ready)
+        if isinstance(ready, PairResult):
+            return ready
+        # Of a prepared pair of which nothing is traced, the initial pose may be that of `global_pose`.
+        distance = min(ready.max_coarse_distance, pair.max_coarse_distance)
+        return self._register_prepared(replace(ready, doubt=ready.doubt or pair.doubt, max_coarse_distance=distance))
 
     @_of_a_pair
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
