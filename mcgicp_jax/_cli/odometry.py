@@ -268,6 +268,9 @@ def _report(poses: list[Pose], truth: list[Pose | None], results: list[mcg.Regis
     best, first = 1e3 * metrics.ate(estimated, true), 1e3 * metrics.ate(estimated, true, alignment="first")
     print(f"ATE:       {best:.1f} mm rms after the best alignment, {first:.1f} mm aligned at the first pose")
     length = float(np.linalg.norm(np.diff(np.array(true)[:, :3, 3], axis=0), axis=1).sum())
+    if not length:
+        print("drift:     unknown, since the sensor does not move")
+        return
     segments = [segment for segment in metrics.KITTI_LENGTHS if segment < length] or [length / 2]
     percent, degrees = metrics.kitti_errors(estimated, true, lengths=segments, step=1)
     lengths = ", ".join(f"{segment:.3g}" for segment in segments)

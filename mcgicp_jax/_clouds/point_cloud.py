@@ -307,7 +307,7 @@ class PointCloud(eqx.Module):
         shapes = {name: np.shape(fields[name]) for name in ("points", "valid", "origin")}
         shapes |= {"covariances": (*shapes["points"], 3), "times": shapes["valid"]}
         channels: Any = arrays.get("channels")
-        for name in arrays.keys() & {"points", "channels", "covariances"}:
+        for name in arrays.keys() & {"points", "channels", "covariances", "times"}:
             if arrays[name] is not None:
                 array, dtype = _as_float(name, arrays[name]), self.points.dtype
                 # JAX warns of conversions to float64 where it has none.
@@ -318,7 +318,7 @@ class PointCloud(eqx.Module):
                 arrays[name] = array[..., None] if single else array
         if np.ma.is_masked(channels):
             valid = arrays.get("channel_valid", self.channel_valid)
-            arrays["channel_valid"] = _checked_mask(channels, valid, np.shape(channels))
+            arrays["channel_valid"] = _checked_mask(channels, valid, np.shape(arrays["channels"]))
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
             if np.shape(value) != expected and not (name in ("covariances", "times") and value is None):
@@ -384,6 +384,10 @@ class PointCloud(eqx.Module):
             parts.append(f"origin {np.array2string(np.asarray(self.origin), precision=1)}")
         return f"PointCloud({', '.join(parts)})"
 
+    def _check_single(self) -> None:
+        if self.points.ndim != 2:
+            raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")
+
     def unpad(self) -> PointCloud:
         """Return the valid rows as a raw cloud: NumPy arrays in the user's frame, float64 if `origin` is not 0.
 
@@ -400,8 +404,7 @@ class PointCloud(eqx.Module):
             # A plain copy takes a tenth of the time of `compress`, and that a quarter of boolean indexing.
             return np.array(array) if all_valid else np.asarray(array).compress(valid, axis=0)
 
-        if self.points.ndim != 2:
-            raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")
+        self._check_single()
         points = copied(self.coordinates if np.any(self.origin) else self.points)
         # The constructor's other checks hold already.
         arrays = {name: copied(getattr(self, name)) for name in ("channels", "channel_valid", "covariances", "times")}
@@ -436,8 +439,9 @@ class PointCloud(eqx.Module):
             size: number of rows; by default the smallest of 128, 192, 256, 384, 512, ... that holds the cloud.
 
         Raises:
-            ValueError: if the cloud has more than `size` rows.
+            ValueError: if the cloud has more than `size` rows, or is a batch.
         """
+        self._check_single()
         size = size_class(self.points.shape[0]) if size is None else size
         missing = size - self.points.shape[0]
         if missing < 0:
@@ -478,8 +482,9 @@ class PointCloud(eqx.Module):
             pose: `jaxlie.SE3` or (4, 4), translation in metres.
 
         Raises:
-            ValueError: if a concrete pose is no rigid motion or has another shape.
+            ValueError: if a concrete pose is no rigid motion or has another shape, or the cloud is a batch.
         """
+        self._check_single()
         matrix = pose_matrix(pose, "pose")
         xp = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
         rotation = xp.asarray(matrix[:3, :3], self.points.dtype)

@@ -90,7 +90,7 @@ def street(
     """
     check_scene(points_per_frame, noise)
     rng, path_rng = scene_and_path_rng(seed)
-    start, end = -2 * _MAX_RANGE, num_frames * step + 2 * _MAX_RANGE
+    start, end = min(0, num_frames * step) - 2 * _MAX_RANGE, max(0, num_frames * step) + 2 * _MAX_RANGE
     road = raycast.Box(np.array([start, -60.0, -1.0]), np.array([end, 60.0, 0.0]))
     things = [_Thing("ground", road, np.full(3, 0.33), 0.2)]
     for side, side_rng in zip((-1, 1), rng.spawn(2), strict=True):
