@@ -1,8 +1,8 @@
 """The point cloud as a container: nothing is lost on the way in, out, through jit, or into a file."""
 
-import copy
 import pickle
 import warnings
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ import jaxlie
 import numpy as np
 import pytest
 
-from mcgicp_jax import KDTreeSearch, PointCloud, PointToPoint, preprocess, register
+from mcgicp_jax import KDTreeSearch, PointCloud, preprocess
 from mcgicp_jax.datasets import Frame
 from tests import reference as ref
 from tests.precision import tolerance
@@ -43,6 +43,11 @@ def leaves(cloud):
     return {name: getattr(cloud, name) for name in cloud.__dataclass_fields__ if name != "channel_names"}
 
 
+def foreign(points, colors=()):
+    """Like a cloud of Open3D."""
+    return SimpleNamespace(points=points, colors=colors)
+
+
 def assert_same(a, b):
     assert a.channel_names == b.channel_names
     for name, value in leaves(a).items():
@@ -52,14 +57,6 @@ def assert_same(a, b):
             np.testing.assert_array_equal(array, other)
 
 
-def test_channels_may_be_a_vector_or_left_out():
-    cloud = PointCloud(POINTS, CHANNELS[:, 0], channel_valid=partial()[:, 0])
-    np.testing.assert_array_equal(cloud.channels, np.where(partial(), CHANNELS, 0)[:, :1])
-    np.testing.assert_array_equal(cloud.channel_valid, partial()[:, :1])
-    bare = PointCloud(POINTS)
-    assert bare.channels.shape == (150, 0) and bare.channel_names == () and len(bare) == 150
-
-
 def test_a_missing_channel_is_stored_as_zero():
     """Whatever stands there, NaN mostly: it never reaches arithmetic."""
     values = np.where(partial(), CHANNELS, np.nan)
@@ -67,12 +64,17 @@ def test_a_missing_channel_is_stored_as_zero():
         cloud = PointCloud(POINTS, form(values), channel_valid=form(partial()))
         np.testing.assert_array_equal(cloud.channels, np.where(partial(), CHANNELS, 0))
         np.testing.assert_array_equal(cloud.channel_valid, partial())
+    # Channels may be a vector, or left out.
+    single = PointCloud(POINTS, values[:, 0], channel_valid=partial()[:, 0])
+    np.testing.assert_array_equal(single.channels, cloud.channels[:, :1])
+    np.testing.assert_array_equal(single.channel_valid, partial()[:, :1])
+    assert PointCloud(POINTS).channels.shape == (150, 0) and PointCloud(POINTS).channel_names == ()
 
 
-@pytest.mark.parametrize("make", [raw, ready().replace, ready(raw(channel_valid=partial())).replace])
-def test_a_mask_that_does_not_fit(make):
-    for mask in (np.ones((150, 1), bool), np.ones((149, 2), bool), np.ones(150, bool), np.ones((150, 2))):
-        refused(lambda mask=mask: make(channel_valid=mask), "channel_valid")
+def test_a_mask_that_does_not_fit():
+    for make in (raw, raw().replace, raw(channel_valid=partial()).replace):
+        for mask in (np.ones((150, 1), bool), np.ones((149, 2), bool), np.ones(150, bool), np.ones((150, 2))):
+            refused(lambda make=make, mask=mask: make(channel_valid=mask), "channel_valid")
 
 
 def test_replaced_channels_keep_the_mask():
@@ -90,7 +92,7 @@ def test_replaced_channels_keep_the_mask():
     np.testing.assert_array_equal(gradient, np.asarray(cloud.channel_valid, float))
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.int16])
+@pytest.mark.parametrize("dtype", [np.float32, np.int16])
 def test_masked_arrays_keep_their_mask(dtype):
     """The data under a mask is arbitrary, often a fill value such as 9999."""
     masked, known = np.arange(150) % 10 == 3, partial()
@@ -113,34 +115,27 @@ def test_masked_arrays_keep_their_mask(dtype):
     np.testing.assert_array_equal(replaced.channel_valid, known & ~partial(1))
     np.testing.assert_array_equal(replaced.channels, np.where(known & ~partial(1), channels, 0))
     assert PointCloud(np.ma.masked_array(points), np.ma.masked_array(channels)).channel_valid is None
-    np.testing.assert_array_equal(PointCloud(Foreign(hidden)).points, cloud.points)
+    np.testing.assert_array_equal(PointCloud(foreign(hidden)).points, cloud.points)
     structured = np.ma.masked_array(np.zeros(5, [(axis, dtype) for axis in "xyz"]))
     structured["x"] = np.ma.masked
     refused(lambda: PointCloud(structured), "points")
 
 
-@pytest.mark.parametrize("size", [150, 333])
-def test_unpad_undoes_pad(size):
+def test_padding_repeats_the_last_row_and_can_be_undone():
     for cloud in (raw(covariances=covariances(), channel_valid=partial()), ready()):
-        assert_same(cloud.pad(size + 10).unpad(), cloud.unpad())
-        assert cloud.pad(size + 10).points.shape == (size + 10, 3) and len(cloud.pad(size + 10)) == 150
-    refused(PointCloud.stack([ready()] * 2).unpad, "points", "(2, 192, 3)")
-    unpadded = ready().unpad()
-    np.testing.assert_array_equal(unpadded.points, POINTS)
-    np.testing.assert_array_equal(unpadded.covariances, covariances())
-    assert isinstance(unpadded.points, np.ndarray)
-    refused(lambda: raw().pad(149), "size")
-
-
-def test_padding_repeats_the_last_row_and_says_so():
-    padded = ready().pad(240)
-    for name in ("points", "channels", "covariances"):
-        rows = np.asarray(getattr(padded, name))
-        np.testing.assert_array_equal(rows[150:], np.broadcast_to(rows[149], rows[150:].shape))
-    assert not padded.valid[150:].any() and (padded.neighbors[150:] == -1).all()
-    np.testing.assert_array_equal(padded.neighbors[:160], ready().neighbors)
+        padded = cloud.pad(343)
+        assert padded.points.shape == (343, 3) and len(padded) == 150 and not padded.valid[150:].any()
+        for name in ("points", "channels", "covariances"):
+            rows = np.asarray(getattr(padded, name))
+            np.testing.assert_array_equal(rows[150:], np.broadcast_to(rows[149], rows[150:].shape))
+        assert_same(padded.unpad(), cloud.unpad())
+    np.testing.assert_array_equal(padded.neighbors[:160], cloud.neighbors)
+    assert (padded.neighbors[150:] == -1).all() and isinstance(padded.unpad().points, np.ndarray)
+    np.testing.assert_array_equal(padded.unpad().points, POINTS)
     assert not raw(channel_valid=partial()).pad(160).channel_valid[150:].any()
     assert PointCloud(np.zeros((0, 3))).pad(4).points.shape == (4, 3)
+    refused(PointCloud.stack([ready()] * 2).unpad, "points", "(2, 192, 3)")
+    refused(lambda: raw().pad(149), "size")
 
 
 def test_features_of_padded_clouds_have_the_derivatives_of_unpadded_ones():
@@ -165,31 +160,25 @@ def test_features_of_padded_clouds_have_the_derivatives_of_unpadded_ones():
 
 def test_replace_exchanges_and_leaves_the_rest():
     cloud = ready()
-    channels = jnp.ones_like(cloud.channels)
-    replaced = cloud.replace(channels=channels)
-    assert_same(replaced, ready().replace(channels=channels))
+    replaced = cloud.replace(channels=jnp.ones_like(cloud.channels))
     assert replaced.points is cloud.points and not np.any(np.asarray(cloud.channels)[:150] == 1)
     # Also where JAX has no float64: without a warning of its own.
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         PointCloud(np.zeros((5, 3))).replace(points=jnp.ones((5, 3), jnp.float32))
     assert len(cloud.replace(channels=jnp.zeros((160, 5))).channel_names) == 5
+    assert cloud.replace(channels=np.zeros(160)).channels.shape == (160, 1)
     assert cloud.replace(covariances=None).covariances is None
     whole = np.round(100 * np.asarray(cloud.channels))
     assert_same(cloud.replace(channels=whole.astype(int)), cloud.replace(channels=whole))
 
 
 def test_replace_refuses_what_does_not_fit():
-    for name, *shapes in (
-        ("points", (159, 3), (160, 2)),
-        ("channels", (159, 2), (159,)),
-        ("covariances", (160, 3), (5,)),
-        ("replace", (160, 3)),
-    ):
-        for shape in shapes:
-            given = {"colour" if name == "replace" else name: np.zeros(shape)}
-            refused(lambda given=given: ready().replace(**given), name)
-    assert ready().replace(channels=np.zeros(160)).channels.shape == (160, 1)
+    shapes = {"points": [(159, 3), (160, 2)], "channels": [(159, 2), (159,)], "covariances": [(160, 3), (5,)]}
+    for name in shapes:
+        for shape in shapes[name]:
+            refused(lambda name=name, shape=shape: ready().replace(**{name: np.zeros(shape)}), name)
+    refused(lambda: ready().replace(colour=np.zeros((160, 3))), "replace")
 
 
 @pytest.mark.parametrize("form", ["numpy", "jax", "jaxlie"])
@@ -229,23 +218,21 @@ def test_transform_under_jit_and_grad():
     np.testing.assert_allclose(gradient[:3, 3], 150, rtol=1e-6)
 
 
-def test_transform_refuses_what_is_no_pose():
-    shear, mirror = np.eye(4) + 1, np.diag([-1.0, 1, 1, 1])
-    for pose in (np.eye(3), 2 * np.eye(4), mirror, np.full((4, 4), np.nan), "left", shear):
-        refused(lambda pose=pose: raw().transform(pose), "pose")
-
-
 def test_stack():
-    clouds = [ready(), ready(raw(covariances=covariances()).transform(T))]
-    clouds[1] = preprocess(clouds[1].unpad(), num_neighbors=4).pad(200)
+    moved = preprocess(raw(covariances=covariances()).transform(T), num_neighbors=4).pad(200)
+    clouds = [ready(), moved]
     stacked = PointCloud.stack(clouds)
-    assert stacked.points.shape == (2, 256, 3)
+    assert stacked.points.shape == (2, 256, 3) and "2" in repr(stacked)
     for i, cloud in enumerate(clouds):
         lane = jax.tree.map(lambda leaf, i=i: leaf[i], stacked)
         assert_same(lane.unpad(), cloud.unpad())
         np.testing.assert_array_equal(lane.neighbors[:150], cloud.neighbors[:150])
         assert not np.any(lane.valid[150:])
-    assert "2" in repr(stacked)
+    far = [ready(PointCloud(POINTS + UTM)), ready(PointCloud(POINTS - UTM))]
+    origins = PointCloud.stack(far).origin
+    np.testing.assert_array_equal(origins, [cloud.origin for cloud in far])
+    assert np.asarray(origins).dtype == np.float64
+    refused(lambda: PointCloud.stack([]), "clouds")
 
 
 def test_stack_of_whole_and_partial_channels():
@@ -258,33 +245,13 @@ def test_stack_of_whole_and_partial_channels():
         np.testing.assert_array_equal(stacked.channels[:, :160], [cloud.channels for cloud in clouds[order]])
 
 
-def test_stack_keeps_large_origins():
-    clouds = [ready(PointCloud(POINTS + UTM)), ready(PointCloud(POINTS - UTM))]
-    stacked = PointCloud.stack(clouds)
-    np.testing.assert_array_equal(stacked.origin, [cloud.origin for cloud in clouds])
-    assert np.asarray(stacked.origin).dtype == np.float64
-    refused(lambda: PointCloud.stack([]), "clouds")
-
-
-def pickled(cloud):
-    return pickle.loads(pickle.dumps(cloud))
-
-
-@pytest.mark.parametrize("through", [pickled, copy.deepcopy])
-def test_copies_are_the_same(through):
-    for cloud in (raw(covariances=covariances()), raw(channel_valid=partial()), ready()):
-        assert_same(through(cloud), cloud)
-        assert repr(through(cloud)) == repr(cloud)
-
-
 def test_a_cloud_is_pickled_whose_search_is_defined_in_a_function():
     class Search(KDTreeSearch):
         pass
 
     # So many that not all neighbours are found yet.
     cloud = preprocess(np.random.default_rng(0).random((5000, 3)), search=Search())
-    found = pickled(cloud)
-    np.testing.assert_array_equal(found.neighbors, cloud.neighbors)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(cloud)).neighbors, cloud.neighbors)
 
 
 def test_a_cloud_goes_through_jit():
@@ -325,13 +292,6 @@ def test_repr_is_short_and_says_what_matters():
         assert "ShapeDtypeStruct" in repr(jax.eval_shape(lambda cloud: cloud, cloud))
 
 
-class Foreign:
-    """Like a cloud of Open3D."""
-
-    def __init__(self, points, colors=()):
-        self.points, self.colors = points, colors
-
-
 def test_a_rotation_of_few_digits_becomes_one():
     typed = np.round(T, 4)
     assert np.abs(typed[:3, :3] @ typed[:3, :3].T - np.eye(3)).max() > 1e-6
@@ -353,11 +313,11 @@ def test_clouds_of_other_libraries_are_taken(tmp_path):
     assert cloud.channel_names == ("intensity", "red", "green", "blue")
     np.testing.assert_allclose(cloud.points, points, atol=1e-6)
     np.testing.assert_allclose(cloud.channels, [[i, 1, 0.2, 0] for i in range(5)], atol=1e-7)
-    colored = PointCloud(Foreign(points, 0.5 * np.abs(points)))
+    colored = PointCloud(foreign(points, 0.5 * np.abs(points)))
     assert colored.channel_names == ("red", "green", "blue")
     np.testing.assert_array_equal(colored.points, points)
     for none in ([], np.zeros((0, 3))):
-        assert PointCloud(Foreign(points, none)).channels.shape == (5, 0)
+        assert PointCloud(foreign(points, none)).channels.shape == (5, 0)
     rows = np.zeros(5, [(name, "f4") for name in ("x", "y", "z", "heat", "dust")])
     rows["heat"] = [1, np.nan, 3, 4, np.nan]
     cloud = PointCloud(rows)
@@ -398,8 +358,6 @@ def test_what_other_libraries_have_instead_of_arrays():
 
     refused(lambda: PointCloud(Tensor()), "points", "requires grad", ".detach()")
     refused(lambda: PointCloud(points, Tensor()), "channels", "requires grad", ".detach()")
-    result = register(POINTS, POINTS, PointToPoint())
-    refused(lambda: register(POINTS, POINTS, PointToPoint(), init=result), "init", "pass its .matrix")
 
 
 def test_tables_with_named_columns_and_clouds_of_tensors():
@@ -415,49 +373,38 @@ def test_tables_with_named_columns_and_clouds_of_tensors():
     cloud = PointCloud(Table())
     assert cloud.channel_names == ("intensity",)
     np.testing.assert_array_equal(cloud.points, points)
-
-    class Tensor:
-        def __init__(self, array):
-            self.numpy = lambda: array
+    positions, bytes_of_colors = (SimpleNamespace(numpy=lambda array=array: array) for array in (points, colors))
 
     class Attributes(dict):
         __getattr__ = dict.__getitem__
 
-    class Tensors:
-        point = Attributes(positions=Tensor(points), colors=Tensor(colors))
-
-    cloud = PointCloud(Tensors())
+    cloud = PointCloud(SimpleNamespace(point=Attributes(positions=positions, colors=bytes_of_colors)))
     assert cloud.channel_names == ("red", "green", "blue")
     np.testing.assert_allclose(cloud.channels, colors / 255, rtol=1e-6)
-    del Tensors.point["colors"]
-    assert PointCloud(Tensors()).channels.shape == (5, 0)
+    assert PointCloud(SimpleNamespace(point=Attributes(positions=positions))).channels.shape == (5, 0)
 
 
 def test_points_of_a_depth_image():
-    """Against a loop over the pixels, for whole millimetres and for metres."""
+    """For whole millimetres and for metres."""
     rng = np.random.default_rng(0)
     depth = rng.integers(300, 4000, (5, 7)).astype(np.uint16)
     depth[0, 1], depth[2, 3] = 0, 65535
     color, (fx, fy, cx, cy) = rng.integers(0, 256, (5, 7, 3)).astype(np.uint8), (6.5, 6.0, 3.1, 2.2)
-    points, colors = [], []
-    for row in range(5):
-        for column in range(7):
-            if depth[row, column] not in (0, 65535) and depth[row, column] <= 3000:
-                z = depth[row, column] / 1000
-                points.append([(column - cx) * z / fx, (row - cy) * z / fy, z])
-                colors.append(color[row, column] / 255)
+    camera = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    row, column = np.nonzero((depth > 0) & (depth <= 3000))
+    z = depth[row, column] / 1000
+    points, colors = np.stack([(column - cx) * z / fx, (row - cy) * z / fy, z], axis=1), color[row, column] / 255
     cloud = PointCloud.from_depth(depth, (fx, fy, cx, cy), color, max_depth=3)
     np.testing.assert_allclose(cloud.points, points, rtol=1e-6)
     np.testing.assert_allclose(cloud.channels, colors, rtol=1e-6)
     assert cloud.channel_names == ("red", "green", "blue") and cloud.points.dtype == np.float32
     metres = np.where(np.isin(depth, (0, 65535)), np.nan, depth / 1000)
-    camera = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
     grey = PointCloud.from_depth(metres, camera, color[..., 0] / 255, max_depth=3)
     np.testing.assert_allclose(grey.points, points, rtol=1e-12)
-    np.testing.assert_allclose(grey.channels[:, 0], np.array(colors)[:, 0])
+    np.testing.assert_allclose(grey.channels[:, 0], colors[:, 0])
     assert grey.channel_names == ("intensity",)
-    half = PointCloud.from_depth(depth, (fx, fy, cx, cy), scale=2000, max_depth=1.5)
-    np.testing.assert_allclose(half.points, np.array(points) / 2, rtol=1e-6)
+    half = PointCloud.from_depth(depth, camera, scale=2000, max_depth=1.5)
+    np.testing.assert_allclose(half.points, points / 2, rtol=1e-6)
     refused(lambda: PointCloud.from_depth(depth[None], camera), "depth")
     refused(lambda: PointCloud.from_depth(depth, np.eye(4)), "intrinsics")
     refused(lambda: PointCloud.from_depth(depth, camera, color[:, :3]), "color")

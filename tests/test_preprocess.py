@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mcgicp_jax import GICP, PointCloud, datasets, preprocess
+from mcgicp_jax import PointCloud, datasets, preprocess
 from mcgicp_jax._clouds.coordinate_steps import harmful_steps
 from mcgicp_jax._clouds.voxels import grid_of
 from tests import reference as ref
 from tests.precision import tolerance
-from tests.scenes import prepare
 
 POINTS, CHANNELS = ref.scene(150, 2)
 UTM = np.array([512_345.6, 5_403_210.9, 312.3])
@@ -49,37 +48,32 @@ def test_voxels_hold_the_mean_of_what_falls_into_them(seed, voxel_size, shift):
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**31), voxel_size=st.floats(0.05, 5), share=st.sampled_from([0.1, 0.5, 0.9]))
 def test_a_voxel_averages_each_channel_over_the_points_that_have_it(seed, voxel_size, share):
-    rng = np.random.default_rng(seed)
-    present = rng.random((150, 2)) < share
+    present = np.random.default_rng(seed).random((150, 2)) < share
     present[0] = False
     cloud = ready(PointCloud(POINTS, np.where(present, CHANNELS, np.nan), channel_valid=present), voxel_size=voxel_size)
     # Large voxels may leave nothing missing.
-    mask = np.ones(cloud.channels.shape, bool) if cloud.channel_valid is None else np.asarray(cloud.channel_valid)
+    mask = np.ones(cloud.channels.shape, bool) if cloud.channel_valid is None else cloud.channel_valid
     for i in range(2):
         # A cloud of the points with this channel alone has the same means in the same cells.
-        mine = np.asarray(cloud.valid) & mask[:, i]
-        rows = CHANNELS[present[:, i], i : i + 1], in_grid(POINTS)[present[:, i]]
-        expected = ref.voxel_means(*rows, voxel_size)
-        np.testing.assert_allclose(
-            np.sort(np.asarray(cloud.channels)[mine, i]), np.sort(expected[:, 0]), atol=tolerance(1e-6, 1e-12)
-        )
-        np.testing.assert_array_equal(np.asarray(cloud.channels)[~mine, i], 0)
-    whole = ready(PointCloud(POINTS, CHANNELS), voxel_size=voxel_size)
-    np.testing.assert_array_equal(cloud.points, whole.points)
+        expected = ref.voxel_means(CHANNELS[present[:, i], i : i + 1], in_grid(POINTS)[present[:, i]], voxel_size)
+        means = np.sort(cloud.channels[mask[:, i], i])
+        np.testing.assert_allclose(means, np.sort(expected[:, 0]), atol=tolerance(1e-6, 1e-12))
+        np.testing.assert_array_equal(cloud.channels[~mask[:, i], i], 0)
+    np.testing.assert_array_equal(cloud.points, ready(PointCloud(POINTS, CHANNELS), voxel_size=voxel_size).points)
 
 
-@pytest.mark.parametrize(("point", "channel", "kept"), [(False, False, 150), (True, False, 149), (False, True, 149)])
-def test_the_mask_is_that_of_the_points_that_are_kept(point, channel, kept):
+@pytest.mark.parametrize(("point", "channel"), [(False, False), (True, False), (False, True)])
+def test_the_mask_is_that_of_the_points_that_are_kept(point, channel):
     """A channel that is said to be there must be finite; of a cloud that lacks nothing there is no mask."""
     points, channels, present = POINTS.copy(), CHANNELS.copy(), np.ones((150, 2), bool)
     if point:
         points[3], present[3] = np.nan, False
     if channel:
         channels[3:5, 1], present[3] = np.nan, [True, False]
-    with pytest.warns(UserWarning, match="1 of 150") if kept < 150 else contextlib.nullcontext():
+    with pytest.warns(UserWarning, match="1 of 150") if point or channel else contextlib.nullcontext():
         cloud = ready(PointCloud(points, channels, channel_valid=present))
-    missing = 0 if cloud.channel_valid is None else np.sum(~np.asarray(cloud.channel_valid)[:kept])
-    assert len(cloud) == kept and missing == channel and (cloud.channel_valid is None) == (not channel)
+    assert len(cloud) == 150 - (point or channel) and (cloud.channel_valid is None) == (not channel)
+    assert not channel or np.sum(~cloud.channel_valid) == 1
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -129,16 +123,16 @@ def test_arrays_are_not_to_be_changed_in_place():
 
 
 def test_rows_that_are_not_finite_are_left_out_with_one_warning():
-    points, channels = POINTS.copy(), CHANNELS.copy()
-    points[3, 1], points[9, 2], channels[17, 0], channels[3, 1] = np.nan, -np.inf, np.inf, np.nan
-    covariances = np.tile(np.eye(3), (150, 1, 1))
-    covariances[20, 1, 1] = np.nan
+    """Nor are those that are finite in float64 alone; the arithmetic does not warn."""
+    points, channels, covariances = POINTS.copy(), CHANNELS.copy(), np.tile(np.eye(3), (150, 1, 1))
+    points[3, 1], points[9, 2], points[11, 0], covariances[20, 1, 1] = np.nan, -np.inf, 1e39, np.nan
+    channels[3, 1], channels[17, 0], channels[18, 1] = np.nan, np.inf, -1e300
     for array in (points, channels, covariances):
         array.setflags(write=False)
-    with pytest.warns(UserWarning, match="4 of 150") as caught:
+    with pytest.warns(UserWarning, match="6 of 150") as caught:
         cloud = ready(PointCloud(points, channels, covariances=covariances))
     assert len(caught) == 1
-    keep = ~np.isin(np.arange(150), [3, 9, 17, 20])
+    keep = ~np.isin(np.arange(150), [3, 9, 11, 17, 18, 20])
     np.testing.assert_array_equal(cloud.unpad().points, POINTS[keep])
     np.testing.assert_array_equal(cloud.unpad().channels, CHANNELS[keep])
 
@@ -171,6 +165,7 @@ PLACES = {
 }
 
 
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", PLACES)
 def test_placeholders_are_the_places_that_many_more_rows_share_than_any_near_one(name):
     rng = np.random.default_rng(0)
@@ -183,9 +178,7 @@ def test_placeholders_are_the_places_that_many_more_rows_share_than_any_near_one
     many = (counts > 5) & (counts > 5 * counts[nearest].max(axis=1))
     zero = (points == 0).all(axis=1)
     measured = np.where(zero, np.cumsum(zero) == 1, ~many[position.ravel()])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        np.testing.assert_array_equal(preprocess(points, None).points, points[measured])
+    np.testing.assert_array_equal(preprocess(points, None).points, points[measured])
 
 
 @pytest.mark.parametrize(("count", "distance"), [(25, 50), (25, 300), (250, 300)])
@@ -268,13 +261,11 @@ def test_coarse_steps_of_coordinates_are_found(name):
 
 def test_large_coordinates_lose_nothing():
     points = POINTS + UTM
-    cloud, local = ready(points, num_neighbors=20), ready(POINTS, num_neighbors=20)
+    cloud, local = ready(points, num_neighbors=20), ready(num_neighbors=20)
     assert np.abs(cloud.points).max() < 5
     assert np.asarray(cloud.origin).dtype == np.float64
     np.testing.assert_allclose(cloud.unpad().points, points, rtol=0, atol=tolerance(2e-7, 1e-9))
     np.testing.assert_array_equal(cloud.neighbors, local.neighbors)
-    found = prepare(GICP(), cloud).covariance, prepare(GICP(), local).covariance
-    np.testing.assert_allclose(*found, atol=tolerance(1e-4, 1e-6))
     # In voxels, and preprocessed again.
     expected = ref.voxel_means(points, in_grid(points), 0.5)
     actual = ready(points, voxel_size=0.5).unpad().points
@@ -301,12 +292,11 @@ FORMS = {
 
 @pytest.mark.parametrize("form", FORMS)
 def test_every_real_form_of_numbers_is_taken(form):
-    points, channels = FORMS[form](POINTS), FORMS[form](CHANNELS)
-    cloud = ready(PointCloud(points, channels))
-    assert cloud.points.dtype in (jnp.float32, jnp.float64)
-    assert cloud.channels.dtype == cloud.points.dtype
-    np.testing.assert_array_equal(np.asarray(cloud.points)[:150], np.asarray(points, float))
-    np.testing.assert_array_equal(np.asarray(cloud.channels)[:150], np.asarray(channels, float))
+    values = [FORMS[form](array) for array in (POINTS, CHANNELS)]
+    cloud = ready(PointCloud(*values))
+    assert cloud.points.dtype == cloud.channels.dtype and cloud.points.dtype in (jnp.float32, jnp.float64)
+    for array, expected in zip((cloud.points, cloud.channels), values, strict=True):
+        np.testing.assert_array_equal(np.asarray(array)[:150], np.asarray(expected, float))
 
 
 BAD_CLOUDS = {
@@ -323,6 +313,7 @@ BAD_CLOUDS = {
     "names": ("channel_names", lambda: PointCloud(POINTS, CHANNELS, channel_names=["intensity"])),
     "three points": ("4 finite points.*3", lambda: ready(POINTS[:3])),
     "nothing finite": ("4 finite points.*0 of 150", lambda: ready(POINTS * np.nan)),
+    "beyond float32": ("4 finite points.*0 of 150", lambda: ready(POINTS + 1e40)),
     "channels NaN": ("0 of 150, .*channel_valid", lambda: ready(PointCloud(POINTS, np.nan * CHANNELS))),
     "three finite": ("4 finite points.*3 of 5", lambda: ready(np.add(POINTS[:5], [[np.inf], [np.nan], [0], [0], [0]]))),
     "k of 2": ("num_neighbors", lambda: ready(num_neighbors=2)),
@@ -345,33 +336,19 @@ def test_malformed_input_is_turned_away_by_name(case):
         make()
 
 
-CHANNELS_WITH_NAN = np.where(np.arange(300).reshape(150, 2) < 10, [0, np.nan], CHANNELS)
-MANY = np.random.default_rng(0).random((500, 3))
-
-
-@pytest.mark.parametrize(
-    ("told", "make", "silent"),
-    [
-        ("voxel_size: 1.0 m leaves 8 of 500", lambda: preprocess(MANY, 1.0), lambda: preprocess(MANY, 1.0, 5)),
-        (
-            "left out 5 of 150 .* 5 of them .*channel_valid",
-            lambda: ready(PointCloud(POINTS, CHANNELS_WITH_NAN)),
-            lambda: ready(PointCloud(POINTS, CHANNELS), voxel_size=0.1),
-        ),
-        (
-            "points: 100% .*voxel_size=",
-            lambda: ready(np.repeat(POINTS, 2, axis=0)),
-            lambda: ready(np.repeat(POINTS, 2, axis=0), voxel_size=1e-3),
-        ),
-    ],
-    ids=["few voxels", "channels", "duplicates"],
-)
-def test_losses_are_warned_of(told, make, silent):
-    with pytest.warns(UserWarning, match=f"^{told}"):
-        make()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        silent()
+def test_losses_are_warned_of():
+    many, twice = np.random.default_rng(0).random((500, 3)), np.repeat(POINTS, 2, axis=0)
+    channels = np.where(np.arange(300).reshape(150, 2) < 10, [0, np.nan], CHANNELS)
+    for told, make, silent in (
+        ("voxel_size: 1.0 m leaves 8 of 500", lambda: preprocess(many, 1.0), lambda: preprocess(many, 1.0, 5)),
+        ("points: 100% .*voxel_size=", lambda: ready(twice), lambda: ready(twice, voxel_size=1e-3)),
+        ("left out 5 of 150 .* 5 of them .*channel_valid", lambda: ready(PointCloud(POINTS, channels)), ready),
+    ):
+        with pytest.warns(UserWarning, match=f"^{told}"):
+            make()
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            silent()
 
 
 @pytest.mark.parametrize("first", [True, False])
@@ -393,5 +370,5 @@ def test_the_first_zero_that_is_complete_is_kept():
     points, channels = POINTS.copy(), CHANNELS.copy()
     points[[3, 4, 5]], channels[3] = 0, np.nan
     with pytest.warns(UserWarning, match="left out 1 of 150 points"):
-        found = ready(PointCloud(points, channels))
-    assert len(found) == 148 and np.sum((found.points == 0).all(axis=1)) == 1
+        kept = ready(PointCloud(points, channels)).points
+    assert len(kept) == 148 and np.sum((kept == 0).all(axis=1)) == 1
