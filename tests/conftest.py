@@ -74,6 +74,17 @@ def data() -> pathlib.Path:
     return DATA
 
 
+@pytest.fixture
+def command(capsys):
+    """Runs the command line with its arguments, numbers and paths among them; its exit code, output and errors."""
+    from mcgicp_jax.__main__ import main
+
+    def run(*arguments):
+        return main([str(argument) for argument in arguments]), *capsys.readouterr()
+
+    return run
+
+
 @pytest.fixture(scope="module")
 def noisy(precision):
     """A pair with 5 cm of noise on a 2 m cloud, so that terms missing from a gradient show."""
