@@ -1,7 +1,6 @@
 """`mcgicp batch`: a table that grows row by row, is completed when the command is run again, and loses nothing."""
 
 import csv
-import os
 import shutil
 import signal
 import subprocess
@@ -13,7 +12,6 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io
-from mcgicp_jax.__main__ import main
 from mcgicp_jax.metrics import pose_error
 from tests.scenes import motion, room_corner
 
@@ -46,162 +44,147 @@ def table(path):
 def write_pairs(path, rows, columns=("source", "target")):
     with open(path, "w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([columns, *rows])
-    return str(path)
+    return path
 
 
 def matrix(row):
     return np.vstack([np.reshape([float(row[name]) for name in POSE], (3, 4)), [0, 0, 0, 1]])
 
 
-def run_folder(folder, output, *options):
-    return main(["batch", str(folder), "--glob", "*.ply", "--output", str(output), *OPTIONS, *options])
+@pytest.fixture
+def batch(command):
+    """Runs `mcgicp batch` on pairs or a folder, to a table; the exit code, output and errors."""
+    return lambda pairs, output, *options: command("batch", pairs, "--output", output, *OPTIONS, *options)
 
 
-def test_a_folder_is_registered_file_by_file(folder, tmp_path, capsys):
-    output = tmp_path / "results.csv"
-    assert run_folder(folder, output) == 0
-    rows = sorted(table(output), key=lambda row: row["source"])
-    assert [(row["source"], row["target"]) for row in rows] == [
-        (f"scan_{i + 1}.ply", f"scan_{i}.ply") for i in range(NUM_FILES - 1)
-    ]
+def test_a_folder_is_registered_file_by_file(folder, tmp_path, batch):
+    code, text, _ = batch(folder, tmp_path / "results.csv", "--glob", "*.ply")
+    assert code == 0 and f"{NUM_FILES - 1} CONVERGED" in text and "intensity" in text
+    rows = sorted(table(tmp_path / "results.csv"), key=lambda row: row["source"])
+    assert len(rows) == NUM_FILES - 1
     for i, row in enumerate(rows):
+        assert (row["source"], row["target"]) == (f"scan_{i + 1}.ply", f"scan_{i}.ply")
         assert row["status"] == "CONVERGED" and row["reason"] == ""
         assert max(pose_error(matrix(row), np.linalg.inv(pose(i)) @ pose(i + 1))) < 0.03
         assert int(row["inliers"]) > 900
         assert np.float32(row["overlap"]) == np.float32(int(row["inliers"]) / 1000)
-        deviations = [float(row[f"deviation_{axis}"]) for axis in ("x", "y", "z", "rx", "ry", "rz")]
-        assert np.all(np.array(deviations) > 1e-5) and np.all(np.array(deviations) < 0.01)
-    text = capsys.readouterr().out
-    assert f"{NUM_FILES - 1} CONVERGED" in text and "intensity" in text
+        deviations = np.array([float(row[f"deviation_{axis}"]) for axis in ("x", "y", "z", "rx", "ry", "rz")])
+        assert np.all(deviations > 1e-5) and np.all(deviations < 0.01)
 
 
 @pytest.mark.slow
-def test_processes_write_the_table_of_threads(folder, tmp_path, capsys):
+def test_processes_write_the_table_of_threads(folder, tmp_path, batch):
     tables = [tmp_path / "threads.csv", tmp_path / "processes.csv"]
-    assert run_folder(folder, tables[0]) == run_folder(folder, tables[1], "--workers", "2") == 0
+    for path, options in zip(tables, ([], ["--workers", 2]), strict=True):
+        assert batch(folder, path, "--glob", "*.ply", *options)[0] == 0
     assert tables[0].read_text() == tables[1].read_text()
-    assert run_folder(folder, tmp_path / "none.csv", "--workers", "0") == 2
-    assert "workers: " in capsys.readouterr().err
+    code, _, errors = batch(folder, tmp_path / "none.csv", "--glob", "*.ply", "--workers", 0)
+    assert code == 2 and "workers: " in errors
 
 
-def test_a_second_run_does_what_is_missing_or_could_not_be_registered(folder, tmp_path, capsys):
+def test_a_second_run_does_what_is_missing_or_could_not_be_registered(folder, tmp_path, batch):
     for i in (0, 1):
         shutil.copy2(folder / f"scan_{i}.ply", tmp_path)
     names, output = [f"scan_{i}.ply" for i in range(3)], tmp_path / "results.csv"
     pairs = write_pairs(tmp_path / "pairs.csv", [names[:2], names[1:]])
-    command = ["batch", pairs, "--output", str(output), *OPTIONS]
-    assert main(command) == 1
+    assert batch(pairs, output)[0] == 1
     before, first = table(output), "".join(output.read_text().splitlines(keepends=True)[:2])
     assert [row["status"] for row in before] == ["CONVERGED", "INVALID_INPUT"]
     # As a process leaves it that is killed while it writes.
     output.write_text(first + "scan_1.ply,scan_2.p")
-    capsys.readouterr()
-    assert main(command) == 1
-    assert "2, of which 1 are in" in capsys.readouterr().out
+    code, text, _ = batch(pairs, output)
+    assert code == 1 and "2, of which 1 are in" in text
     assert output.read_text().startswith(first) and table(output) == before
     shutil.copy2(folder / names[2], tmp_path)
-    assert main(command) == 0
-    assert "2, of which 1 are in" in capsys.readouterr().out
-    assert output.read_text().startswith(first)
+    code, text, _ = batch(pairs, output)
+    assert code == 0 and "2, of which 1 are in" in text and output.read_text().startswith(first)
     assert [(row["source"], row["status"]) for row in table(output)] == [(name, "CONVERGED") for name in names[:2]]
     complete = output.read_text()
-    assert main(command) == 0
-    assert output.read_text() == complete
+    assert batch(pairs, output)[0] == 0 and output.read_text() == complete
 
 
-def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, capsys):
+def test_pairs_that_fail_have_messages_of_their_own(folder, tmp_path, batch):
     far, start = motion((50.0, 0, 0, 0, 0, 0))[:3].ravel(), np.eye(4)[:3].ravel()
     sources = {"missing.ply": start, "scan_1.ply": start, "notes.txt": start, "scan_2.ply": far}
     lines = [(source, "scan_0.ply", *pose) for source, pose in sources.items()]
     pairs, output = write_pairs(folder / "bad.csv", lines, ("source", "target", *POSE)), tmp_path / "results.csv"
-    assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1
+    code, text, errors = batch(pairs, output)
+    assert code == 1 and "done:      4 of 4, " in text and f"table:     {output}\n" in text
+    assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors and "Errno" not in errors
     rows = {row["source"]: row for row in table(output)}
     assert rows["scan_1.ply"]["status"] == "CONVERGED"
     assert rows["scan_2.ply"]["status"] == "TOO_FEW_CORRESPONDENCES"
     assert "fewer than four points have a match" in rows["scan_2.ply"]["reason"]
     for name in ("missing.ply", "notes.txt"):
         assert rows[name]["status"] == "INVALID_INPUT" and name in rows[name]["reason"]
-    text, errors = capsys.readouterr()
-    assert "mcgicp: missing.ply scan_0.ply: source:" in errors and "3 of 4 pairs" in errors and "Errno" not in errors
-    assert "done:      4 of 4, " in text and f"table:     {output}\n" in text
     # Files that cannot be read have no rate.
-    assert main(["batch", pairs, "--output", str(output), *OPTIONS]) == 1
-    assert "done:      2 of 2\n" in capsys.readouterr().out
+    code, text, _ = batch(pairs, output)
+    assert code == 1 and "done:      2 of 2\n" in text
 
 
-def test_a_degenerate_pair_names_its_unconstrained_directions(tmp_path, capsys):
+def test_a_degenerate_pair_names_its_unconstrained_directions(tmp_path, batch):
     for seed in range(2):
         noise = np.random.default_rng(seed).normal(size=(1000, 3))
         io.write(tmp_path / f"floor_{seed}.ply", mcg.PointCloud(noise * [1, 1, 0.01]))
     output = tmp_path / "results.csv"
-    command = ["batch", str(tmp_path), "--output", str(output), *OPTIONS]
-    assert main(command) == 1
+    assert batch(tmp_path, output)[0] == 1
     (row,) = table(output)
     assert row["status"] == "DEGENERATE" and row["reason"].startswith("unconstrained: translation along (")
     output.write_text(output.read_text().replace("DEGENERATE", "unknown"))
-    assert main(command) == 2 and "such as CONVERGED, got unknown" in capsys.readouterr().err
+    code, _, errors = batch(tmp_path, output)
+    assert code == 2 and "such as CONVERGED, got unknown" in errors
 
 
-def test_a_pair_from_several_starts(folder, tmp_path, capsys):
+def test_a_pair_from_several_starts(folder, tmp_path, batch):
     """Rows are in the order of the pairs, which tells the starts apart; a start that is added is run alone."""
     starts = [motion((50.0, 0, 0, 0, 0, 0)), np.eye(4), pose(1)]
-    lines = [["scan_1.ply", "scan_0.ply", *start[:3].ravel()] for start in starts]
-    for scan in ("scan_0.ply", "scan_1.ply"):
-        shutil.copy2(folder / scan, tmp_path)
+    lines = [[folder / "scan_1.ply", folder / "scan_0.ply", *start[:3].ravel()] for start in starts]
     for rows, done in ((lines[::2], 0), (lines, 2)):
         pairs = write_pairs(tmp_path / "pairs.csv", rows, ("source", "target", *POSE))
-        assert main(["batch", pairs, "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 1
-        assert (f"of which {done}" in capsys.readouterr().out) == bool(done)
+        code, text, _ = batch(pairs, tmp_path / "results.csv")
+        assert code == 1 and (f"of which {done}" in text) == bool(done)
     statuses = [row["status"] for row in table(tmp_path / "results.csv")]
     assert statuses == ["TOO_FEW_CORRESPONDENCES", "CONVERGED", "CONVERGED"]
 
 
-def test_a_list_that_makes_no_sense(tmp_path, capsys):
+def test_a_list_that_makes_no_sense(tmp_path, batch):
+    unreadable, posed = "source,target\nx.ply,y.ply\nz.ply,y.ply\n", ",".join(["source,target", *POSE])
     for content, message in (
         ("a,b\n1,2\n", "source and target"),
         ("source,target\n", "pairs"),
         ("source,target\nx.ply,\n", "line 2"),
         ("source,target\nx.ply,y.ply\nx.ply,y.ply\n", "once"),
-        ("source,target\nx.ply,y.ply\nz.ply,y.ply\n", "0 of 2 pairs can be read; the first error: "),
-        ("source,target\nx.ply,y.ply\nz.ply,y.ply\n", "x.ply"),
-        (",".join(["source,target", *POSE]) + "\nx.ply,y.ply" + 12 * ",a", "line 2"),
-        (",".join(["source,target", *POSE[:-1], "m32"]) + "\nx.ply,y.ply" + 12 * ",1", "or none, got no m23"),
-        (",".join(["source,target", *POSE]).upper().replace("SOURCE,TARGET", "source,target"), "or none, got no m00"),
+        (unreadable, "0 of 2 pairs can be read; the first error: "),
+        (unreadable, "x.ply"),
+        (posed + "\nx.ply,y.ply" + 12 * ",a", "line 2"),
+        (posed.replace("m23", "m32") + "\nx.ply,y.ply" + 12 * ",1", "or none, got no m23"),
+        (posed.replace("m", "M"), "or none, got no m00"),
         ("\x80\xff", "pairs.csv: "),
     ):
         (tmp_path / "pairs.csv").write_bytes(content.encode("latin-1"))
-        assert main(["batch", str(tmp_path / "pairs.csv"), "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 2
-        errors = capsys.readouterr().err
-        assert message in errors and errors.count("\n") == 1
+        code, _, errors = batch(tmp_path / "pairs.csv", tmp_path / "results.csv")
+        assert code == 2 and message in errors and errors.count("\n") == 1
 
 
-def test_warnings_name_the_files_of_their_pair(folder, tmp_path, capsys):
+def test_warnings_name_the_files_of_their_pair(folder, tmp_path, batch):
+    """In a list of a spreadsheet, with a byte order mark and blanks after the commas."""
     cloud = io.read(folder / "scan_1.ply")
     points = np.array(cloud.points)
     points[3] = np.nan
     io.write(tmp_path / "broken.npz", cloud.replace(points=points))
     shutil.copy2(folder / "scan_0.ply", tmp_path)
-    rows = [["scan_0.ply", "scan_0.ply"], ["broken.npz", "scan_0.ply"]]
-    pairs = write_pairs(tmp_path / "pairs.csv", rows)
-    assert main(["batch", pairs, "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 0
-    assert "broken.npz scan_0.ply: source: left out 1 of 1000" in capsys.readouterr().err
+    pairs = tmp_path / "pairs.csv"
+    pairs.write_text("source, target\nscan_0.ply, scan_0.ply\nbroken.npz, scan_0.ply\n", encoding="utf-8-sig")
+    code, _, errors = batch(pairs, tmp_path / "results.csv")
+    assert code == 0 and "broken.npz scan_0.ply: source: left out 1 of 1000" in errors
 
 
-def test_a_list_from_a_spreadsheet(folder, tmp_path):
-    """With a byte order mark, and blanks after the commas."""
-    pairs = folder / "marked.csv"
-    pairs.write_text("source, target\nscan_1.ply, scan_0.ply\n", encoding="utf-8-sig")
-    assert main(["batch", str(pairs), "--output", str(tmp_path / "results.csv"), *OPTIONS]) == 0
-
-
-def test_a_table_must_be_a_csv_file_of_results(folder, tmp_path, capsys):
+def test_a_table_must_be_a_csv_file_of_results(folder, tmp_path, batch):
     (tmp_path / "precious.csv").write_text("a,b\n1,2\n")
-    for name, message in (
-        *((name, "output: expected a .csv file") for name in ("table.npz", "table.ply", "results.txt")),
-        ("precious.csv", "precious.csv: "),
-    ):
-        assert run_folder(folder, tmp_path / name) == 2
-        assert message in capsys.readouterr().err
+    names = dict.fromkeys(("table.npz", "table.ply", "results.txt"), "output: expected a .csv file")
+    for name, message in (names | {"precious.csv": "precious.csv: "}).items():
+        code, _, errors = batch(folder, tmp_path / name)
+        assert code == 2 and message in errors
     assert (tmp_path / "precious.csv").read_text() == "a,b\n1,2\n"
 
 
@@ -209,20 +192,17 @@ def test_a_table_must_be_a_csv_file_of_results(folder, tmp_path, capsys):
 def test_control_c_loses_nothing_that_is_done(folder, tmp_path):
     names = [f"scan_{i}.ply" for i in range(NUM_FILES)]
     repeated = [(a, f"../{folder.name}/{'./' * k}{b}") for k in range(60) for a in names for b in names if a != b]
-    pairs = write_pairs(folder / "many.csv", repeated)
-    output = tmp_path / "results.csv"
-    command = [sys.executable, "-m", "mcgicp_jax", "batch", pairs, "--output", str(output), *OPTIONS]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ)
+    pairs, output = write_pairs(folder / "many.csv", repeated), tmp_path / "results.csv"
+    command = [sys.executable, "-m", "mcgicp_jax", "batch", pairs, "--output", output, *OPTIONS]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     deadline = time.monotonic() + 120
     while (not output.exists() or output.read_text().count("\n") < 20) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     text, errors = process.communicate(timeout=60)
-    assert process.returncode == 130
-    assert "run the same command again" in errors and "Traceback" not in errors
+    assert process.returncode == 130 and "run the same command again" in errors and "Traceback" not in errors
     rows = table(output)
-    assert 19 <= len(rows) < len(repeated)
-    assert f"done:      {len(rows):,} of {len(repeated):,}" in text
+    assert 19 <= len(rows) < len(repeated) and f"done:      {len(rows):,} of {len(repeated):,}" in text
 
 
 class Interrupts:
@@ -234,13 +214,13 @@ class Interrupts:
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("lost", [False, True])
-def test_an_interrupted_run_is_completed_by_the_next(folder, tmp_path, capsys, monkeypatch, lost):
+def test_an_interrupted_run_is_completed_by_the_next(folder, tmp_path, batch, monkeypatch, lost):
     for path in sorted(folder.glob("*.ply"))[:3]:
         shutil.copy(path, tmp_path)
     # Neither these nor the table of the first runs is a cloud.
     io.write_poses(tmp_path / "poses.txt", [pose(1), pose(2)])
     (tmp_path / ".0123.tmp").write_text("left by a killed process")
-    completed = mcg.register_as_completed
+    completed, before = mcg.register_as_completed, signal.getsignal(signal.SIGINT)
 
     def interrupted(*arguments, **options):
         answers = completed(*arguments, **options)
@@ -251,31 +231,32 @@ def test_an_interrupted_run_is_completed_by_the_next(folder, tmp_path, capsys, m
             raise KeyboardInterrupt
         yield from answers
 
-    command = ["batch", str(tmp_path), "--output", str(tmp_path / "results.csv"), *OPTIONS]
-    before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(mcg, "register_as_completed", interrupted)
-    assert main(command) == 130
-    assert signal.getsignal(signal.SIGINT) is before and "interrupted" in capsys.readouterr().err
-    monkeypatch.undo()
-    assert main(command) == 0
-    assert "2, of which 1 are in" in capsys.readouterr().out
-    assert main(command) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(mcg, "register_as_completed", interrupted)
+        code, _, errors = batch(tmp_path, tmp_path / "results.csv")
+    assert code == 130 and signal.getsignal(signal.SIGINT) is before and "interrupted" in errors
+    code, text, _ = batch(tmp_path, tmp_path / "results.csv")
+    assert code == 0 and "2, of which 1 are in" in text
+    assert batch(tmp_path, tmp_path / "results.csv")[0] == 0
 
 
-def test_each_pair_has_voxels_of_its_own(tmp_path):
+def test_each_pair_has_voxels_of_its_own(tmp_path, command):
     """As in `register_batch`; one size for all would suit the first pair only."""
     rng, lines = np.random.default_rng(0), np.stack(np.meshgrid(np.arange(0, 2, 0.01), np.arange(0, 2, 0.1)), -1)
     corner = np.concatenate([np.insert(lines.reshape(-1, 2), axis, 0, axis=1) for axis in range(3)])
-    sources, targets = (
-        [mcg.PointCloud(k * (corner + 0.002 * rng.normal(size=corner.shape))) for k in (1, 4)] for _ in "st"
-    )
-    for i, clouds in enumerate(zip(sources, targets, strict=True)):
-        for side, cloud in zip("st", clouds, strict=True):
-            io.write(tmp_path / f"{side}{i}.npz", cloud)
-    listed = write_pairs(tmp_path / "pairs.csv", [(f"s{i}.npz", f"t{i}.npz") for i in range(2)])
-    main(["batch", listed, "--output", str(tmp_path / "out.csv"), "--method", "gicp"])
-    sizes = [mcg.preprocess(target).voxel_size for target in targets]
-    assert sizes[0] is not None and sizes[1] > 2 * sizes[0]
-    expected = mcg.register_batch(sources, targets, mcg.GICP())
+    clouds = {
+        f"{side}{scale}.npz": mcg.PointCloud(scale * (corner + 0.002 * rng.normal(size=corner.shape)))
+        for side in "st"
+        for scale in (1, 4)
+    }
+    for name, cloud in clouds.items():
+        io.write(tmp_path / name, cloud)
+    pairs = [(f"s{scale}.npz", f"t{scale}.npz") for scale in (1, 4)]
+    listed = write_pairs(tmp_path / "pairs.csv", pairs)
+    command("batch", listed, "--output", tmp_path / "out.csv", "--method", "gicp")
+    first, second = (mcg.preprocess(clouds[target]).voxel_size for _, target in pairs)
+    assert first is not None and second > 2 * first
+    sources, targets = zip(*pairs, strict=True)
+    expected = mcg.register_batch([clouds[name] for name in sources], [clouds[name] for name in targets], mcg.GICP())
     for row, result in zip(table(tmp_path / "out.csv"), expected, strict=True):
         np.testing.assert_array_equal(matrix(row)[:3], result.matrix[:3])

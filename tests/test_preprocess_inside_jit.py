@@ -43,21 +43,19 @@ def test_neighbours_are_those_of_the_host(points, search):
 
 def test_rows_that_are_not_finite_become_padding():
     points, channels = surface(600)
-    bad = points.copy()
-    bad[[0, 17, 599], [0, 1, 2]] = np.nan, np.inf, -np.inf
-    finite = np.isfinite(bad).all(axis=1)
+    points[[0, 17, 599], [0, 1, 2]] = np.nan, np.inf, -np.inf
+    finite = np.isfinite(points).all(axis=1)
 
-    def preprocessed(points):
+    def preprocessed(points, channels=channels):
         return mcg.preprocess(PointCloud(points, channels), None)
 
-    found, expected = jax.jit(preprocessed)(bad), mcg.preprocess(PointCloud(bad[finite], channels[finite]), None)
+    found, expected = jax.jit(preprocessed)(points), preprocessed(points[finite], channels[finite])
     np.testing.assert_array_equal(found.valid, np.arange(600) < 597)
-    np.testing.assert_array_equal(found.points[:597], expected.points)
-    np.testing.assert_array_equal(found.channels[:597], expected.channels)
-    np.testing.assert_array_equal(found.neighbors[:597], expected.neighbors)
+    for name in ("points", "channels", "neighbors"):
+        np.testing.assert_array_equal(getattr(found, name)[:597], getattr(expected, name))
     # Features of padding are finite.
     np.testing.assert_array_equal(found.points[597:], np.broadcast_to(expected.points[-1], (3, 3)))
-    slopes = jax.jit(jax.grad(lambda points: jnp.sum(preprocessed(points).points[:597] ** 2)))(bad)
+    slopes = jax.jit(jax.grad(lambda points: jnp.sum(preprocessed(points).points[:597] ** 2)))(points)
     assert np.isfinite(slopes).all() and (slopes[~finite] == 0).all()
     nothing = jax.jit(preprocessed)(np.full_like(points, np.nan))
     assert not nothing.valid.any() and (nothing.points == 0).all()
@@ -67,15 +65,16 @@ def averaged(points, channels, channel_valid=None, size=SIZE):
     return mcg.preprocess(PointCloud(points, channels, channel_valid=channel_valid), VOXEL, size=size)
 
 
+# One program for all tests of these shapes.
+averaged_inside = jax.jit(averaged, static_argnums=3)
+
+
 def test_means_of_voxels():
     points, channels = surface()
     measured = np.random.default_rng(1).random(channels.shape) < 0.7
-    found = jax.jit(averaged)(points, channels, measured)
+    found = averaged_inside(points, channels, measured)
     assert found.channel_valid.dtype == bool and found.points.dtype == found.channels.dtype == np.float32
-    order, numbers, count = (
-        np.asarray(each) for each in _voxels_of(*map(jnp.asarray, (points, np.ones(len(points), bool))), VOXEL)
-    )
-    count = int(count)
+    order, numbers, count = map(np.asarray, jax.jit(_voxels_of)(points, np.ones(len(points), bool), VOXEL))
     assert np.sum(found.valid) == count == numbers.max() + 1
     for number in range(count):
         rows = order[numbers == number]
@@ -90,20 +89,18 @@ def test_means_of_voxels():
     assert count == pytest.approx(len(mcg.preprocess(points, VOXEL)), rel=0.1)
     expected = mcg.preprocess(found.points[:count], None)
     np.testing.assert_array_equal(found.neighbors[:count], expected.neighbors)
+    # Too many voxels leave no valid row.
+    assert not np.any(averaged_inside(points, channels, measured, 100).valid)
 
 
 def test_order_and_padding_of_the_points_do_not_matter():
     points, channels = surface()
     rows = np.random.default_rng(2).permutation(len(points))
+    one = averaged_inside(points, channels, np.ones(channels.shape, bool))
     padded = PointCloud(points[rows], channels[rows]).pad(2048)
-    one = jax.jit(averaged)(points, channels)
     other = jax.jit(partial(mcg.preprocess, voxel_size=VOXEL, size=SIZE))(padded)
     np.testing.assert_allclose(one.points, other.points, atol=1e-5)
     np.testing.assert_allclose(one.channels, other.channels, atol=1e-5)
-
-
-def test_of_too_many_voxels_no_row_is_valid():
-    assert not np.any(jax.jit(partial(averaged, size=100))(*surface()).valid)
 
 
 @in_float64
@@ -141,24 +138,21 @@ def test_from_raw_points_to_a_loss_under_vmap():
 
 
 def test_what_is_missing_is_said():
-    points, channels = surface()
-    cloud = PointCloud(points, channels)
-    for name, options in (
+    cloud = PointCloud(*surface())
+    for named, options in (
         ("voxel_size", {}),
         ("size", {"voxel_size": 0.1}),
         ("size", {"voxel_size": 0.1, "size": 0}),
         ("voxel_size", {"voxel_size": -1.0}),
         ("num_neighbors", {"voxel_size": None, "num_neighbors": 2}),
     ):
-        call = jax.jit(partial(mcg.preprocess, **options))
-        refused(lambda call=call: call(cloud), name)
-    refused(lambda: jax.jit(partial(mcg.preprocess, voxel_size=None))(points[None]), "cloud")
-    refused(lambda: jax.jit(lambda points: mcg.register(points, points, mcg.GICP()).cost)(points), "source: cloud")
+        refused(lambda options=options: jax.jit(partial(mcg.preprocess, **options))(cloud), named)
+    refused(lambda: jax.jit(partial(mcg.preprocess, voxel_size=None))(cloud.points[None]), "cloud")
+    refused(lambda: jax.jit(lambda p: mcg.register(p, p, mcg.GICP()).cost)(cloud.points), "source: cloud")
 
 
 def test_the_size_of_a_concrete_cloud():
-    points, channels = surface()
-    found, whole = averaged(points, channels), mcg.preprocess(PointCloud(points, channels), VOXEL)
+    found, whole = averaged(*surface()), mcg.preprocess(PointCloud(*surface()), VOXEL)
     assert found.points.shape[0] == SIZE and len(found) == len(whole)
     np.testing.assert_array_equal(found.points[: len(whole)], whole.points)
-    refused(lambda: averaged(points, channels, size=100), "size", len(whole), 100)
+    refused(lambda: averaged(*surface(), size=100), "size", len(whole), 100)
