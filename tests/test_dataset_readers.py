@@ -7,10 +7,10 @@ import pytest
 import scipy.io
 from PIL import Image
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from mcgicp_jax import io, metrics
-from mcgicp_jax.datasets import clouds, ford_campus, kitti, seven_scenes, tum_rgbd
+from mcgicp_jax.datasets import Frame, clouds, ford_campus, kitti, seven_scenes, tum_rgbd
 from tests.refusals import refused
 from tests.scenes import motion
 
@@ -28,14 +28,16 @@ def save_image(path, array):
 
 def colors_differ(first, second, reach):
     """Mean difference of the colours of points that lie at the same place in the world."""
-    clouds = [frame.cloud.transform(frame.pose) for frame in (first, second)]
-    rows = [np.arange(len(c)) if c.channel_valid is None else np.flatnonzero(c.channel_valid[:, -1]) for c in clouds]
-    points, colors = zip(
-        *((c.points[row], c.channels[row, -3:]) for c, row in zip(clouds, rows, strict=True)), strict=True
-    )
-    chosen = np.random.default_rng(0).permutation(len(points[0]))[:20_000]
-    distance, nearest = cKDTree(points[1]).query(points[0][chosen])
-    return np.abs(colors[0][chosen] - colors[1][nearest])[distance < reach].mean()
+
+    def colored(frame):
+        cloud = frame.cloud.transform(frame.pose)
+        rows = slice(None) if cloud.channel_valid is None else cloud.channel_valid[:, -1]
+        return cloud.points[rows], cloud.channels[rows, -3:]
+
+    (points, colors), (others, other_colors) = colored(first), colored(second)
+    chosen = np.random.default_rng(0).permutation(len(points))[:20_000]
+    distance, nearest = cKDTree(others).query(points[chosen])
+    return np.abs(colors[chosen] - other_colors[nearest])[distance < reach].mean()
 
 
 # KITTI
@@ -50,13 +52,10 @@ def kitti_folder(tmp_path):
     """Scans 3 and 4 of sequence 77: the one ahead of the camera, the other all around."""
     folder = tmp_path / "sequences" / "77"
     (folder / "velodyne").mkdir(parents=True)
-    ahead = np.array(
-        [[10.5, 0, 0, 0.1], [10.5, 3, 1, 0.2], [5.5, -2, -0.5, 0.3], [-10.5, 0, 0, 0.4], [10.5, 9, 0, 0.5]]
-    )
-    around = np.random.default_rng(0).normal(scale=10, size=(50, 4))
-    around[:, 3] = np.abs(around[:, 3])
+    ahead = [[10.5, 0, 0, 0.1], [10.5, 3, 1, 0.2], [5.5, -2, -0.5, 0.3], [-10.5, 0, 0, 0.4], [10.5, 9, 0, 0.5]]
+    around = np.random.default_rng(0).uniform([-20, -20, -20, 0], 20, (50, 4))
     for number, scan in ((3, ahead), (4, around)):
-        scan.astype("<f4").tofile(folder / "velodyne" / f"{number:06d}.bin")
+        np.asarray(scan, "<f4").tofile(folder / "velodyne" / f"{number:06d}.bin")
         save_image(folder / "image_2" / f"{number:06d}.png", ramp(41, 101).astype(np.uint8))
     lines = [f"{name}: {' '.join(map(str, row))}" for name, row in (CALIBRATION | {"Tr": TO_CAMERA}).items()]
     (folder / "calib.txt").write_text("\n".join([*lines, "calib_time: 09-Jan-2012"]))
@@ -68,29 +67,25 @@ def kitti_folder(tmp_path):
 
 def test_kitti_points_get_the_color_of_their_pixel(kitti_folder):
     (kitti_folder / "velodyne" / "of no number.bin").touch()
-    frames = kitti(kitti_folder)
-    assert len(frames) == 2
-    cloud = frames[0].cloud
-    assert cloud.channel_names == ("intensity", "red", "green", "blue")
-    np.testing.assert_allclose(cloud.channels[:, 0], [0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-6)
+    first, _ = kitti(kitti_folder)
+    assert first.cloud.channel_names == ("intensity", "red", "green", "blue")
+    np.testing.assert_allclose(first.cloud.channels[:, 0], [0.1, 0.2, 0.3, 0.4, 0.5], atol=1e-6)
     # Depth 10 and 5; u = (100 x + 50 z + 35) / z, with x = −y of the scan; v = 100 y / z + 20, with y = −z of the scan.
     # The first two lie half way between pixels.
     image = ramp(41, 101).astype(np.uint8) / 255
     expected = [image[20, 53:55].mean(axis=0), image[10, 23:25].mean(axis=0), image[30, 97]]
-    np.testing.assert_allclose(cloud.channels[:3, 1:], expected, atol=1e-6)
-    known = np.repeat([[1, 1, 1, 1], [1, 0, 0, 0]], (3, 2), axis=0)
-    np.testing.assert_array_equal(cloud.channel_valid, known == 1)
+    np.testing.assert_allclose(first.cloud.channels[:3, 1:], expected, atol=1e-6)
+    np.testing.assert_array_equal(first.cloud.channel_valid, [[True] * 4] * 3 + [[True, False, False, False]] * 2)
 
 
 def test_kitti_times_and_poses_go_by_the_number_of_the_scan(kitti_folder):
-    frames = kitti(str(kitti_folder))
-    assert [frame.time for frame in frames] == pytest.approx([0.3, 0.4])
+    first, second = kitti(str(kitti_folder))
+    assert [first.time, second.time] == pytest.approx([0.3, 0.4])
     to_camera = np.vstack([np.reshape(TO_CAMERA, (3, 4)), [0, 0, 0, 1]])
-    np.testing.assert_allclose(
-        frames[1].pose, np.linalg.inv(to_camera) @ motion((4, 0, 0.4, 0, 0.08, 0)) @ to_camera, atol=1e-9
-    )
+    expected = np.linalg.inv(to_camera) @ motion((4, 0, 0.4, 0, 0.08, 0)) @ to_camera
+    np.testing.assert_allclose(second.pose, expected, atol=1e-9)
     # A step of the camera ahead is one of the Velodyne ahead.
-    np.testing.assert_allclose(kitti(kitti_folder)[0].pose[:3, 3], [0.3, -3, 0], atol=0.1)
+    np.testing.assert_allclose(first.pose[:3, 3], [0.3, -3, 0], atol=0.1)
     shutil.rmtree(kitti_folder.parents[1] / "poses")
     shutil.rmtree(kitti_folder / "image_2")
     bare = kitti(kitti_folder)[0]
@@ -102,12 +97,11 @@ def test_real_kitti_scans_have_the_colors_of_the_road(data):
     assert len(frames) == 10
     first, second = frames[:2]
     assert np.mean(first.cloud.channel_valid[:, 1]) == pytest.approx(0.16, abs=0.02)
-    relative = np.linalg.inv(first.pose) @ second.pose
-    np.testing.assert_allclose(relative[:3, 3], [1.31, 0, 0], atol=0.05)
+    np.testing.assert_allclose((np.linalg.inv(first.pose) @ second.pose)[:3, 3], [1.31, 0, 0], atol=0.05)
     assert second.time - first.time == pytest.approx(0.104, abs=0.01)
     # Where the two see the same spot it has the same colour, more so than in the colours of other pixels.
     right = colors_differ(first, second, 0.1)
-    swapped = type(second)(second.cloud.replace(channels=second.cloud.channels[::-1]), second.pose, None)
+    swapped = Frame(second.cloud.replace(channels=second.cloud.channels[::-1]), second.pose)
     assert right < 0.07 and right < 0.5 * colors_differ(first, swapped, 0.1)
 
 
@@ -131,26 +125,16 @@ def tum_folder(tmp_path):
 
 
 def test_tum_frames_are_put_together_by_time(tum_folder):
-    frames = tum_rgbd(tum_folder)
-    assert len(frames) == 2
-    assert [frame.time for frame in frames] == [1.0, 1.1]
-    cloud = frames[0].cloud
-    np.testing.assert_allclose(cloud.points[:, 2], [1, 2])
-    np.testing.assert_allclose(
-        cloud.points[:, :2],
-        [
-            [(200 - 325.1) / 520.9, (100 - 249.7) / 521.0],
-            np.multiply(2, [(400 - 325.1) / 520.9, (300 - 249.7) / 521.0]),
-        ],
-        rtol=1e-5,
-    )
-    np.testing.assert_allclose(cloud.channels[:, :2], [[200 / 639, 100 / 479], [400 / 639, 300 / 479]], atol=0.005)
-    assert cloud.channel_valid is None
+    first, second = tum_rgbd(tum_folder)
+    assert [first.time, second.time] == [1.0, 1.1]
+    pixels, depth = np.array([[200, 100], [400, 300]]), np.array([[1], [2]])
+    rays = (pixels - [325.1, 249.7]) / [520.9, 521.0]
+    np.testing.assert_allclose(first.cloud.points, np.hstack([depth * rays, depth]), rtol=1e-5)
+    np.testing.assert_allclose(first.cloud.channels[:, :2], pixels / [639, 479], atol=0.005)
+    assert first.cloud.channel_valid is None
     # Half way between two poses; and beyond the last of them.
-    times = Slerp([0.96, 1.04], Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.2]]))
-    np.testing.assert_allclose(frames[0].pose[:3, :3], times(1.0).as_matrix(), atol=1e-9)
-    np.testing.assert_allclose(frames[0].pose[:3, 3], [0.05, 0, 0], atol=1e-9)
-    assert frames[1].pose is None
+    np.testing.assert_allclose(first.pose, motion((0.05, 0, 0, 0, 0, 0.1)), atol=1e-9)
+    assert second.pose is None
     # Between two poses more than 0.1 s apart, the motion is not known.
     io.write_poses(tum_folder / "groundtruth.txt", [np.eye(4)] * 2, [0.93, 1.04])
     assert tum_rgbd(tum_folder)[0].pose is None
@@ -159,38 +143,30 @@ def test_tum_frames_are_put_together_by_time(tum_folder):
 
 
 def test_the_real_tum_pair_in_the_layout_of_the_data_set(data, tmp_path):
-    folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
-    folder.mkdir()
-    rows = []
-    for i, name in enumerate(("prev", "curr")):
-        for kind in ("img", "dep"):
-            shutil.copy(data / "tum_fr1_xyz" / f"{kind}_{name}.png", folder)
-        rows.append(f"{i} {(data / 'tum_fr1_xyz' / f'pose_{name}.txt').read_text().strip()}")
+    real, folder = data / "tum_fr1_xyz", tmp_path / "rgbd_dataset_freiburg1_xyz"
+    shutil.copytree(real, folder)
     (folder / "depth.txt").write_text("0 dep_prev.png\n1 dep_curr.png\n")
     (folder / "rgb.txt").write_text("0.01 img_prev.png\n1.01 img_curr.png\n")
-    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows))
+    rows = [f"{i} {(real / f'pose_{name}.txt').read_text().strip()}\n" for i, name in enumerate(("prev", "curr"))]
+    (folder / "groundtruth.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(rows))
     target, source = tum_rgbd(folder)
     shift, turn = metrics.pose_error(source.pose, target.pose)
-    assert 0.01 < shift < 0.05 and turn < 0.05
-    assert len(source.cloud) > 150_000
+    assert 0.01 < shift < 0.05 and turn < 0.05 and len(source.cloud) > 150_000
     # The measured poses make the colours agree; moved poses do not.
     right = colors_differ(source, target, 0.01)
     for axis in range(2):
-        moved = source.pose.copy()
-        moved[:3, 3] += 0.03 * source.pose[:3, axis]
-        assert right < 0.8 * colors_differ(type(source)(source.cloud, moved), target, 0.01)
+        moved = Frame(source.cloud, source.pose @ motion(0.03 * np.eye(6)[axis]))
+        assert right < 0.8 * colors_differ(moved, target, 0.01)
 
 
 # 7-Scenes
 
 
 def test_real_frames_of_7_scenes(data):
-    frames = seven_scenes(data / "sevenscenes_redkitchen")
+    folder = data / "sevenscenes_redkitchen"
+    first, *_, last = frames = seven_scenes(folder)
     assert len(frames) == 5 and [frame.time for frame in frames] == pytest.approx([n / 30 for n in range(560, 581, 5)])
-    first, last = frames[0], frames[-1]
-    np.testing.assert_allclose(
-        first.pose, np.loadtxt(data / "sevenscenes_redkitchen" / "frame-000560.pose.txt"), atol=1e-4
-    )
+    np.testing.assert_allclose(first.pose, np.loadtxt(folder / "frame-000560.pose.txt"), atol=1e-4)
     assert 200_000 < len(first.cloud) < 307_200
     assert np.mean(first.cloud.channel_valid) > 0.99
     assert colors_differ(first, last, 0.005) < 0.072
@@ -225,25 +201,23 @@ def ford_folder(tmp_path):
     """Two scans of five points; cameras 1 and 3 of five see some of them; the second scan is too late for an image."""
     folder = tmp_path / "ford"
     (folder / "SCANS").mkdir(parents=True)
-    points = np.array([[1.0, 2, 3, 4, 5], [0, 1, 0, 1, 0], [0.5, 0.5, 0.5, 0.5, -0.5]])
-    empty = {"points_index": np.zeros((1, 0)), "pixels": np.zeros((2, 0)), "xyz": np.zeros((3, 0))}
-    cameras = [dict(empty) for _ in range(5)]
+    cameras = [
+        {"points_index": np.zeros((1, 0)), "pixels": np.zeros((2, 0)), "xyz": np.zeros((3, 0))} for _ in range(5)
+    ]
     cameras[1] |= {"points_index": np.array([[1, 3]]), "pixels": np.array([[1.0, 1616], [1.5, 1231.5]])}
     cameras[3] |= {"points_index": np.array([[3, 5]]), "pixels": np.array([[1.0, 809], [1.5, 617.5]])}
-    dtype = [(name, object) for name in empty]
-    records = np.array([[tuple(camera[name] for name in empty) for camera in cameras]], dtype)
-    for number, late in ((75, 0.0), (76, 1e6)):
+    records = np.array([[tuple(camera.values()) for camera in cameras]], [(name, object) for name in cameras[0]])
+    # The second has reflectances, too.
+    for number, late, more in ((75, 0.0, {}), (76, 1e6, {"reflectivity": np.array([[9.0, 8, 7, 6, 5]])})):
         scan = {
-            "XYZ": points,
+            "XYZ": np.array([[1.0, 2, 3, 4, 5], [0, 1, 0, 1, 0], [0.5, 0.5, 0.5, 0.5, -0.5]]),
             "X_wv": np.array([[10.0], [20], [-1], [0.1], [0.2], [0.3]]),
             "timestamp_camera": 1.2e9 * 1e6 + 30_000 + late,
             "timestamp_laser": 1.2e9 * 1e6 + late,
             "image_index": 0,
             "Cam": records,
         }
-        # The second has reflectances, too.
-        scan |= {"reflectivity": np.array([[9.0, 8, 7, 6, 5]])} if late else {}
-        scipy.io.savemat(folder / "SCANS" / f"Scan{number:04d}.mat", {"SCAN": scan})
+        scipy.io.savemat(folder / "SCANS" / f"Scan{number:04d}.mat", {"SCAN": scan | more})
     for camera in range(5):
         save_image(folder / "IMAGES" / f"Cam{camera}" / "image0011.ppm", ramp(616, 1616).astype(np.uint8))
     (folder / "Timestamp.log").write_text(
@@ -265,21 +239,18 @@ def test_ford_scans_are_colored_by_the_image_of_their_time(ford_folder):
     np.testing.assert_allclose(late.channels[:, 0], [9, 8, 7, 6, 5])
     assert late.channel_valid[:, 0].all() and not late.channel_valid[:, 1:].any()
     # Without images, the points alone.
-    shutil.rmtree(ford_folder / "IMAGES")
-    assert not ford_campus(ford_folder)[0].cloud.channel_valid.any()
-    (ford_folder / "Timestamp.log").unlink()
-    assert not ford_campus(ford_folder)[0].cloud.channel_valid.any()
+    for remove in (lambda: shutil.rmtree(ford_folder / "IMAGES"), (ford_folder / "Timestamp.log").unlink):
+        remove()
+        assert not ford_campus(ford_folder)[0].cloud.channel_valid.any()
 
 
 def test_ford_poses_are_those_of_the_laser(ford_folder):
-    pose = ford_campus(ford_folder)[0].pose
     vehicle, laser = np.eye(4), np.eye(4)
     vehicle[:3, :3] = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_matrix()
-    vehicle[:3, 3] = 10, 20, -1
     # The laser's axes: ahead is the vehicle's right ... its z axis is up, the vehicle's is down.
     laser[:3, :3] = [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
-    laser[:3, 3] = 2.4, -0.01, -2.3
-    np.testing.assert_allclose(pose, vehicle @ laser, atol=1e-9)
+    vehicle[:3, 3], laser[:3, 3] = [10, 20, -1], [2.4, -0.01, -2.3]
+    np.testing.assert_allclose(ford_campus(ford_folder)[0].pose, vehicle @ laser, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -308,40 +279,41 @@ def test_a_folder_without_a_data_set_is_named(tmp_path, reader):
 
 def test_a_folder_of_clouds(tmp_path):
     rng = np.random.default_rng(0)
-    points = rng.normal(size=(50, 3))
-    poses = [motion(rng.normal(size=6)) for _ in range(5)]
+    points, poses = rng.normal(size=(50, 3)), [motion(rng.normal(size=6)) for _ in range(5)]
     normals = rng.normal(size=(50, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    seven = np.hstack([points, normals, rng.uniform(0, 0.01, (50, 1))])
-    kept = {
-        "2.xyz": lambda path: np.savetxt(path, points),
-        "10.txt": lambda path: np.savetxt(path, np.hstack([points, rng.normal(size=(50, 9))])),
-        "11.txt": lambda path: np.savetxt(path, seven),
-        "12.txt": lambda path: np.savetxt(path, np.insert(seven, 3, 0.5, axis=1)),
-        "14.npy": lambda path: np.save(path, points),
-        "15.npz": lambda path: np.savez(path, points=points),
-        "16.ply": lambda path: path.write_text("broken"),
+    seven = np.hstack([points, normals / np.linalg.norm(normals, axis=1)[:, None], rng.uniform(0, 0.01, (50, 1))])
+    rows = {
+        "2.xyz": points,
+        "10.txt": np.hstack([points, rng.normal(size=(50, 9))]),
+        "11.txt": seven,
+        "12.txt": np.insert(seven, 3, 0.5, axis=1),
+        "14.npy": points,
+        "matrix.txt": poses[0],
+        "matrix.npy": poses[0],
+        "poses.npy": poses,
     }
-    left_out = {
-        "calibration.txt": lambda path: path.write_text("P0: 1 0 0 0\n"),
-        "empty.txt": lambda path: path.touch(),
-        "kitti.txt": lambda path: io.write_poses(path, poses),
-        "matrix.txt": lambda path: np.savetxt(path, poses[0]),
-        "matrix.npy": lambda path: np.save(path, poses[0]),
-        "picture.png": lambda path: path.touch(),
-        "poses.npy": lambda path: np.save(path, poses),
-        "table.csv": lambda path: path.write_text("source,target\na.ply,b.ply\n"),
-        "table.npz": lambda path: np.savez(path, T_target_source=poses),
-        "times.txt": lambda path: path.write_text("0.0\n0.1\n"),
-        "tum.txt": lambda path: io.write_poses(path, poses, np.arange(5.0)),
+    texts = {
+        "16.ply": "broken",
+        "calibration.txt": "P0: 1 0 0 0\n",
+        "empty.txt": "",
+        "picture.png": "",
+        "table.csv": "source,target\na.ply,b.ply\n",
+        "times.txt": "0.0\n0.1\n",
+        ".hidden.ply": "",
     }
-    for name, write in (kept | left_out).items():
-        write(tmp_path / name)
-    (tmp_path / ".hidden.ply").touch()
+    for name, array in rows.items():
+        (np.save if name.endswith(".npy") else np.savetxt)(tmp_path / name, array)
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text)
+    np.savez(tmp_path / "15.npz", points=points)
+    np.savez(tmp_path / "table.npz", T_target_source=poses)
+    io.write_poses(tmp_path / "kitti.txt", poses)
+    io.write_poses(tmp_path / "tum.txt", poses, np.arange(5.0))
     (tmp_path / "folder.ply").mkdir()
     frames = clouds(tmp_path)
-    assert [path.name for path in frames.paths] == list(kept)
-    assert {path.name for path in frames.left_out} == set(left_out)
+    assert [path.stem for path in frames.paths] == ["2", "10", "11", "12", "14", "15", "16"]
+    names = {path.name for path in tmp_path.iterdir()} - {".hidden.ply", "folder.ply"}
+    assert {path.name for path in frames.left_out} == names - {path.name for path in frames.paths}
     np.testing.assert_allclose(frames[0].cloud.points, points)
     assert frames[0].pose is None and len(clouds(tmp_path, "*.npz")) == 1
     refused(lambda: frames[-1], str(tmp_path / "16.ply"))
