@@ -11,6 +11,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
 from tests.refusals import refused
+from tests.scenes import motion
 
 POINTS = np.random.default_rng(0).random((50, 3))
 
@@ -53,12 +54,15 @@ def test_swapped_arguments_are_named():
 
 
 def test_clouds_and_methods_in_the_wrong_form_are_named():
-    cloud, method = mcg.PointCloud(POINTS, POINTS), mcg.GICP()
+    cloud, method, result = mcg.PointCloud(POINTS, POINTS), mcg.GICP(), mcg.RegistrationResult.without_pose
     for named, call, *told in (
         ("source", lambda: mcg.register((POINTS, POINTS), cloud, method), "PointCloud(points, channels)"),
         ("points", lambda: mcg.PointCloud([POINTS, POINTS[:, 0]]), "PointCloud(points, channels)"),
         ("method", lambda: mcg.register(method, cloud, cloud), "Clouds come first"),
         ("source", lambda: mcg.register(POINTS[:, :2], cloud, method), "copies", "prior"),
+        ("init", lambda: mcg.register(POINTS, POINTS, method, init=result(mcg.Status.CONVERGED)), "pass its .matrix"),
+        ("pose", lambda: cloud.transform("left")),
+        ("pose", lambda: cloud.transform(np.eye(4) + 1)),
         ("frames", lambda: mcg.odometry(cloud, method), "one PointCloud"),
         ("frames", lambda: mcg.odometry(POINTS, method), "one ndarray"),
         ("clouds", lambda: mcg.multiway(mcg.datasets.Frame(cloud), method), "one Frame"),
@@ -110,12 +114,8 @@ def test_extensions_whose_numbers_are_not_finite_are_named(method, told):
 
 def test_channels_are_told_apart_by_name():
     """Names of arrays that have none fit any; methods without channels do not ask."""
-    points, channels = np.random.default_rng(0).normal(size=(2, 50, 3))
-    one, other, unnamed = (
-        mcg.preprocess(mcg.PointCloud(points, channels, channel_names=names))
-        for names in (("r", "g", "b"), ("g", "b", "r"), None)
-    )
-    method = mcg.MultiChannelGICP(1.0, 0.1)
+    method, unnamed = mcg.MultiChannelGICP(1.0, 0.1), mcg.preprocess(mcg.PointCloud(POINTS, POINTS))
+    one, other = (unnamed.replace(channel_names=names) for names in (("r", "g", "b"), ("g", "b", "r")))
     moved = other.replace(channels=other.channels + 100)
     with warnings.catch_warnings():
         # Values of different channels are not compared before.
@@ -129,17 +129,16 @@ def test_channels_are_told_apart_by_name():
 
 
 def test_poses_with_rounding_in_the_last_row_and_of_three_rows():
-    cloud = mcg.preprocess(np.random.default_rng(0).normal(size=(50, 3)))
-    pose = np.eye(4)
-    pose[:3, 3] = 0.01
+    cloud, pose = mcg.preprocess(POINTS), motion((0.01, 0.01, 0.01, 0, 0, 0))
     expected = mcg.register(cloud, cloud, mcg.GICP(), init=pose).matrix
-    rounded = pose.copy()
-    rounded[3] += [1e-17, -1e-17, 0, 2e-16]
-    for given in (rounded, pose[:3]):
-        np.testing.assert_array_equal(mcg.register(cloud, cloud, mcg.GICP(), init=given).matrix, expected)
+    for init in (pose + np.outer([0, 0, 0, 1], [1e-17, -1e-17, 0, 2e-16]), pose[:3]):
+        np.testing.assert_array_equal(mcg.register(cloud, cloud, mcg.GICP(), init=init).matrix, expected)
     matches = mcg.find_correspondences(cloud, cloud, pose, mcg.GICP(), max_distance=1.0)
-    inside = jax.jit(lambda pose: mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()))(pose[:3])
-    np.testing.assert_allclose(inside, mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint()), rtol=1e-5)
+
+    def cost(pose):
+        return mcg.mahalanobis_cost(pose, cloud, cloud, matches, mcg.PointToPoint())
+
+    np.testing.assert_allclose(jax.jit(cost)(pose[:3]), cost(pose), rtol=1e-5)
 
 
 @pytest.mark.parametrize("transformation", [jax.jit, jax.grad])
@@ -156,8 +155,9 @@ def test_functions_of_many_clouds_name_what_is_traced(transformation):
         ("poses[0]", lambda _, pose: mcg.estimate_channel_covariance([cloud, cloud], [pose, still])),
     ):
 
+        @transformation
         def inside(points, call=call):
             call(cloud.replace(points=points), still + 0 * points[0, 0])
             return 0.0
 
-        refused(lambda inside=inside: transformation(inside)(cloud.points), named, "tracers")
+        refused(lambda inside=inside: inside(cloud.points), named, "tracers")

@@ -71,16 +71,10 @@ class PseudoHuber(mcg.AbstractKernel):
         return 1 / jnp.sqrt(1 + square / scale**2)
 
 
-def read_toy(file, size):
-    """A file format: coordinates as text."""
-    return mcg.PointCloud(np.loadtxt(file))
-
-
-def write_toy(file, cloud):
-    np.savetxt(file, cloud.points)
-
-
-TOY = mcg.io.Format(read_toy, write_toy)
+# A file format: coordinates as text.
+TOY = mcg.io.Format(
+    lambda file, size: mcg.PointCloud(np.loadtxt(file)), lambda file, cloud: np.savetxt(file, cloud.points)
+)
 
 
 class Folder(mcg.datasets.AbstractFrames):
@@ -143,30 +137,28 @@ def test_a_term():
 
 def test_a_tree():
     source, target, _ = pair(size=400, truth=motion((0.02, 0.01, 0, 0, 0.01, 0.02)))
-    np.testing.assert_array_equal(
-        BruteForce().neighbors(target.points, 20), mcg.KDTreeSearch().neighbors(target.points, 20)
-    )
+    searches = BruteForce(), mcg.KDTreeSearch()
+    np.testing.assert_array_equal(*(search.neighbors(target.points, 20) for search in searches))
     for method in (mcg.GICP(), mcg.MultiChannelGICP()):
-        results = [mcg.register(source, target, method, search=search) for search in (BruteForce(), mcg.KDTreeSearch())]
-        np.testing.assert_array_equal(results[0].matrix, results[1].matrix)
+        results = [mcg.register(source, target, method, search=search).matrix for search in searches]
+        np.testing.assert_array_equal(*results)
 
 
 def test_a_robust_kernel():
-    source, target, truth = pair(size=400)
+    *clouds, truth = pair(size=400)
     squares = jnp.linspace(0, 9, 7)
     slopes = jax.jit(jax.vmap(jax.grad(lambda square: PseudoHuber(1.5).rho(square[None])[0])))(squares)
     np.testing.assert_allclose(PseudoHuber(1.5).weight(squares), slopes, rtol=1e-5)
     # A tenth of the source is off by 0.2 m.
-    points = np.array(source.points)
+    points = np.array(clouds[0].points)
     points[::10] += 0.2
-    errors = []
-    for robust in (None, PseudoHuber(0.02)):
-        result = mcg.register(
-            source.replace(points=points), target, mcg.PointToPoint(), robust=robust, max_distance=1.0, init=truth
-        )
-        assert result.converged
-        errors.append(mcg.metrics.pose_error(result.matrix, truth)[0])
-    assert errors[1] < 0.7 * errors[0]
+    clouds[0], options = clouds[0].replace(points=points), {"max_distance": 1.0, "init": truth}
+    plain, robust = (
+        mcg.register(*clouds, mcg.PointToPoint(), robust=kernel, **options) for kernel in (None, PseudoHuber(0.02))
+    )
+    assert plain.converged and robust.converged
+    errors = [mcg.metrics.pose_error(result.matrix, truth)[0] for result in (robust, plain)]
+    assert errors[0] < 0.7 * errors[1]
 
 
 def test_a_file_format(tmp_path, monkeypatch):
@@ -257,11 +249,10 @@ def test_integers_beside_other_numbers_leave_these_as_they_are():
 def test_the_command_line_has_what_is_registered(tmp_path):
     """If it is registered before the commands are imported."""
     source, target, _ = pair(size=400)
-    scans = tmp_path / "scans"
+    scans, poses = tmp_path / "scans", tmp_path / "poses.txt"
     scans.mkdir()
     for name, cloud in (("0.toy", target), ("1.toy", source)):
-        with open(scans / name, "wb") as file:
-            write_toy(file, cloud)
+        np.savetxt(scans / name, cloud.points)
     script = f"""
 import sys
 import mcgicp_jax as mcg
@@ -274,9 +265,8 @@ extend.FORMATS[".toy"] = TOY
 extend.DATASETS["folder"] = mcg.datasets.Dataset(Folder, (0.3, 0.3))
 from mcgicp_jax.__main__ import main
 
-options = ["--method", "ridge", "--robust", "pseudo-huber", "1.0", "--output", {str(tmp_path / "poses.txt")!r}]
+options = ["--method", "ridge", "--robust", "pseudo-huber", "1.0", "--output", {str(poses)!r}]
 sys.exit(main(["odometry", "folder", {str(scans)!r}, *options]))
 """
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
-    assert ended.returncode == 0, ended.stderr
-    assert len(mcg.io.read_poses(tmp_path / "poses.txt")) == 2
+    assert ended.returncode == 0 and len(mcg.io.read_poses(poses)) == 2, ended.stderr
