@@ -39,10 +39,6 @@ def ready(cloud=None):
     return preprocess(raw(covariances=covariances()) if cloud is None else cloud, num_neighbors=4).pad(160)
 
 
-def leaves(cloud):
-    return {name: getattr(cloud, name) for name in cloud.__dataclass_fields__ if name != "channel_names"}
-
-
 def foreign(points, colors=()):
     """Like a cloud of Open3D."""
     return SimpleNamespace(points=points, colors=colors)
@@ -50,8 +46,8 @@ def foreign(points, colors=()):
 
 def assert_same(a, b):
     assert a.channel_names == b.channel_names
-    for name, value in leaves(a).items():
-        values, others = jax.tree.leaves(value), jax.tree.leaves(getattr(b, name))
+    for name in a.__dataclass_fields__.keys() - {"channel_names"}:
+        values, others = jax.tree.leaves(getattr(a, name)), jax.tree.leaves(getattr(b, name))
         for array, other in zip(values, others, strict=True):
             assert np.asarray(array).dtype == np.asarray(other).dtype
             np.testing.assert_array_equal(array, other)
@@ -195,18 +191,17 @@ def test_transform_moves_points_and_turns_covariances(form, cloud):
 
 
 def test_transform_keeps_the_digits_of_large_coordinates():
-    points = POINTS + UTM
+    points, far = POINTS + UTM, T.copy()
     moved = ready(PointCloud(points)).transform(T).unpad().points
     np.testing.assert_allclose(moved, points @ T[:3, :3].T + T[:3, 3], rtol=0, atol=tolerance(2e-6, 1e-8))
     # By kilometres: a raw cloud has other points, a preprocessed one keeps its precision, and says where it is.
-    far = T.copy()
     far[:3, 3] += UTM
     expected = POINTS @ far[:3, :3].T + far[:3, 3]
     of_raw, of_ready = raw().transform(far), ready().transform(far)
     assert not np.any(of_raw.origin)
     np.testing.assert_allclose(of_raw.points, expected, rtol=0, atol=1e-8)
-    for found in (of_ready.coordinates[:150], of_ready.unpad().points):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance(2e-6, 1e-8))
+    for moved in (of_ready.coordinates[:150], of_ready.unpad().points):
+        np.testing.assert_allclose(moved, expected, rtol=0, atol=tolerance(2e-6, 1e-8))
 
 
 def test_transform_under_jit_and_grad():

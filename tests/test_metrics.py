@@ -73,6 +73,7 @@ def test_the_error_is_that_of_the_point_asked_for():
         shift = (T - truth)[:3] @ [*point, 1]
         expected = np.linalg.norm(shift), pose_error(T, truth)[1]
         assert pose_error(T, truth, at=point) == pytest.approx(expected, rel=1e-12)
+        assert pose_error(T, truth, at=point)[1] == expected[1]
         assert pose_error(T, truth, at=np.zeros(3)) == pose_error(T, truth)
         np.testing.assert_allclose(inside(jnp.asarray(T), truth, point), expected, rtol=1e-5)
 

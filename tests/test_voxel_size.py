@@ -115,16 +115,14 @@ def test_sparse_lines_are_averaged_as_far_as_500_points_remain():
 
 def test_one_size_for_both_clouds_of_a_pair():
     coarse, fine = lines(0.6), lines(0.25)
-    chosen = [mcg.preprocess(cloud).voxel_size for cloud in (coarse, fine)]
-    assert chosen[0] > chosen[1]
-    both = mcg.register(coarse, fine, mcg.PointToPlane())
-    given = mcg.register(*(mcg.preprocess(cloud, chosen[0]) for cloud in (coarse, fine)), mcg.PointToPlane())
-    np.testing.assert_array_equal(both.matrix, given.matrix)
-    # The raw cloud has the voxels of the preprocessed one.
-    mixed = mcg.register(coarse, mcg.preprocess(fine, chosen[0]), mcg.PointToPlane())
-    np.testing.assert_array_equal(mixed.matrix, given.matrix)
-    for result in mcg.register_batch([coarse] * 2, [fine] * 2, mcg.PointToPlane()):
-        np.testing.assert_array_equal(result.matrix, both.matrix)
+    size = mcg.preprocess(coarse).voxel_size
+    assert size > mcg.preprocess(fine).voxel_size
+    ready, method = [mcg.preprocess(cloud, size) for cloud in (coarse, fine)], mcg.PointToPlane()
+    expected = mcg.register(*ready, method).matrix
+    # Also where the raw cloud has the voxels of a preprocessed one, and in a batch.
+    results = [mcg.register(coarse, fine, method), mcg.register(coarse, ready[1], method)]
+    for result in results + mcg.register_batch([coarse] * 2, [fine] * 2, method):
+        np.testing.assert_array_equal(result.matrix, expected)
 
 
 @pytest.mark.filterwarnings("ignore:.*left out 1 of")
