@@ -33,45 +33,39 @@ def test_unknown_options_are_named(function):
             list(function(*given, **{option: None}).__iter__())
 
 
-def test_swapped_arguments_are_named():
-    cloud = mcg.preprocess(POINTS)
-    matches = mcg.find_correspondences(cloud, cloud, None, mcg.GICP(), max_distance=1.0)
-    for named, call in (
-        ("matches", lambda: mcg.mahalanobis_cost(cloud, cloud, np.eye(4), cloud, mcg.GICP())),
-        ("pose", lambda: mcg.mahalanobis_cost(cloud, cloud, cloud, matches, mcg.GICP())),
-        ("target", lambda: mcg.mahalanobis_cost(cloud, cloud, np.eye(4), matches, mcg.GICP())),
-        ("source", lambda: mcg.find_correspondences(np.eye(4), cloud, cloud, mcg.GICP(), max_distance=1.0)),
+def test_arguments_that_are_swapped_or_in_the_wrong_form_are_named():
+    raw, cloud, method, still = mcg.PointCloud(POINTS, POINTS), mcg.preprocess(POINTS), mcg.GICP(), np.eye(4)
+    matches = mcg.find_correspondences(cloud, cloud, None, method, max_distance=1.0)
+    result = mcg.RegistrationResult.without_pose(mcg.Status.CONVERGED)
+    for named, call, *told in (
+        ("matches", lambda: mcg.mahalanobis_cost(cloud, cloud, still, cloud, method)),
+        ("pose", lambda: mcg.mahalanobis_cost(cloud, cloud, cloud, matches, method)),
+        ("target", lambda: mcg.mahalanobis_cost(cloud, cloud, still, matches, method)),
+        ("source", lambda: mcg.find_correspondences(still, cloud, cloud, method, max_distance=1.0)),
         ("num_candidates", lambda: mcg.D2DNDT(num_candidates=True)),
         ("voxel_sizes", lambda: mcg.register(POINTS, POINTS, mcg.NDT(), voxel_sizes=(0.25, 1.0))),
         ("method", lambda: mcg.register(POINTS, POINTS, mcg.GICP)),
-        ("init", lambda: mcg.register(cloud, cloud, mcg.GICP(), init=np.diag([1, 1, 1, 1.001]))),
-        ("robust", lambda: mcg.register(cloud, cloud, mcg.GICP(), robust=mcg.Huber)),
-        ("executor", lambda: mcg.register_batch([cloud], [cloud], mcg.GICP(), executor=ThreadPoolExecutor)),
+        ("method", lambda: mcg.register(method, raw, raw), "Clouds come first"),
+        ("init", lambda: mcg.register(cloud, cloud, method, init=np.diag([1, 1, 1, 1.001]))),
+        ("init", lambda: mcg.register(POINTS, POINTS, method, init=result), "pass its .matrix"),
+        ("robust", lambda: mcg.register(cloud, cloud, method, robust=mcg.Huber)),
+        ("executor", lambda: mcg.register_batch([cloud], [cloud], method, executor=ThreadPoolExecutor)),
         ("cloud", lambda: mcg.io.write("cloud.ply", POINTS)),
         ("cloud", lambda: mcg.io.write(cloud, "cloud.ply")),
-    ):
-        refused(call, named)
-
-
-def test_clouds_and_methods_in_the_wrong_form_are_named():
-    cloud, method, result = mcg.PointCloud(POINTS, POINTS), mcg.GICP(), mcg.RegistrationResult.without_pose
-    for named, call, *told in (
-        ("source", lambda: mcg.register((POINTS, POINTS), cloud, method), "PointCloud(points, channels)"),
+        ("source", lambda: mcg.register((POINTS, POINTS), raw, method), "PointCloud(points, channels)"),
+        ("source", lambda: mcg.register(POINTS[:, :2], raw, method), "copies", "prior"),
         ("points", lambda: mcg.PointCloud([POINTS, POINTS[:, 0]]), "PointCloud(points, channels)"),
-        ("method", lambda: mcg.register(method, cloud, cloud), "Clouds come first"),
-        ("source", lambda: mcg.register(POINTS[:, :2], cloud, method), "copies", "prior"),
-        ("init", lambda: mcg.register(POINTS, POINTS, method, init=result(mcg.Status.CONVERGED)), "pass its .matrix"),
-        ("pose", lambda: cloud.transform("left")),
-        ("pose", lambda: cloud.transform(np.eye(4) + 1)),
-        ("frames", lambda: mcg.odometry(cloud, method), "one PointCloud"),
+        ("pose", lambda: raw.transform("left")),
+        ("pose", lambda: raw.transform(still + 1)),
+        ("frames", lambda: mcg.odometry(raw, method), "one PointCloud"),
         ("frames", lambda: mcg.odometry(POINTS, method), "one ndarray"),
-        ("clouds", lambda: mcg.multiway(mcg.datasets.Frame(cloud), method), "one Frame"),
-        ("poses", lambda: mcg.plot.before_after(cloud, cloud, [np.eye(4)]), "poses by name", "list"),
-        ("channel_names", lambda: cloud.replace(channels=POINTS, channel_names=()), 3, 0),
+        ("clouds", lambda: mcg.multiway(mcg.datasets.Frame(raw), method), "one Frame"),
+        ("poses", lambda: mcg.plot.before_after(raw, raw, [still]), "poses by name", "list"),
+        ("channel_names", lambda: raw.replace(channels=POINTS, channel_names=()), 3, 0),
     ):
         refused(call, named, *told)
     with pytest.raises(AttributeError, match=r"^points: .* cloud\.replace\(points=\.\.\.\)"):
-        cloud.points = POINTS
+        raw.points = POINTS
 
 
 @pytest.mark.parametrize(

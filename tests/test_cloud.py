@@ -231,9 +231,8 @@ def test_stack():
 
 
 def test_stack_of_whole_and_partial_channels():
-    clouds = [ready(raw()), ready(raw(channel_valid=partial()))]
+    clouds, masks = [ready(raw()), ready(raw(channel_valid=partial()))], [np.ones((150, 2), bool), partial()]
     assert PointCloud.stack(clouds[:1] * 2).channel_valid is None
-    masks = [np.ones((150, 2), bool), partial()]
     for order in (slice(None), slice(None, None, -1)):
         stacked = PointCloud.stack(clouds[order])
         np.testing.assert_array_equal(stacked.channel_valid[:, :150], masks[order])
@@ -407,13 +406,12 @@ def test_points_of_a_depth_image():
 
 
 def test_crop_keeps_points_of_a_range():
-    cloud = raw(covariances=covariances(), channel_valid=partial())
-    ranges = np.linalg.norm(POINTS, axis=1)
+    cloud, ranges = raw(covariances=covariances(), channel_valid=partial()), np.linalg.norm(POINTS, axis=1)
     low, high = np.quantile(ranges, [0.2, 0.7])
-    for found in (cloud.crop(low, high), cloud.pad(160).crop(low, high)):
-        kept = (ranges >= low) & (ranges <= high)
-        np.testing.assert_array_equal(found.points, POINTS[kept])
-        np.testing.assert_array_equal(found.channel_valid, partial()[kept])
-        np.testing.assert_array_equal(found.covariances, covariances()[kept])
+    kept = (ranges >= low) & (ranges <= high)
+    for cropped in (cloud.crop(low, high), cloud.pad(160).crop(low, high)):
+        np.testing.assert_array_equal(cropped.points, POINTS[kept])
+        np.testing.assert_array_equal(cropped.channel_valid, partial()[kept])
+        np.testing.assert_array_equal(cropped.covariances, covariances()[kept])
     assert_same(cloud.crop(), cloud)
     refused(lambda: cloud.crop(2, 1), "min_range")

@@ -244,19 +244,16 @@ def test_each_pair_has_voxels_of_its_own(tmp_path, command):
     """As in `register_batch`; one size for all would suit the first pair only."""
     rng, lines = np.random.default_rng(0), np.stack(np.meshgrid(np.arange(0, 2, 0.01), np.arange(0, 2, 0.1)), -1)
     corner = np.concatenate([np.insert(lines.reshape(-1, 2), axis, 0, axis=1) for axis in range(3)])
-    clouds = {
-        f"{side}{scale}.npz": mcg.PointCloud(scale * (corner + 0.002 * rng.normal(size=corner.shape)))
-        for side in "st"
-        for scale in (1, 4)
-    }
-    for name, cloud in clouds.items():
-        io.write(tmp_path / name, cloud)
-    pairs = [(f"s{scale}.npz", f"t{scale}.npz") for scale in (1, 4)]
-    listed = write_pairs(tmp_path / "pairs.csv", pairs)
+    sources, targets = (
+        [mcg.PointCloud(scale * (corner + 0.002 * rng.normal(size=corner.shape))) for scale in (1, 4)] for _ in "st"
+    )
+    for side, clouds in (("s", sources), ("t", targets)):
+        for i, cloud in enumerate(clouds):
+            io.write(tmp_path / f"{side}{i}.npz", cloud)
+    listed = write_pairs(tmp_path / "pairs.csv", [(f"s{i}.npz", f"t{i}.npz") for i in range(2)])
     command("batch", listed, "--output", tmp_path / "out.csv", "--method", "gicp")
-    first, second = (mcg.preprocess(clouds[target]).voxel_size for _, target in pairs)
+    first, second = (mcg.preprocess(target).voxel_size for target in targets)
     assert first is not None and second > 2 * first
-    sources, targets = zip(*pairs, strict=True)
-    expected = mcg.register_batch([clouds[name] for name in sources], [clouds[name] for name in targets], mcg.GICP())
-    for row, result in zip(table(tmp_path / "out.csv"), expected, strict=True):
+    results = mcg.register_batch(sources, targets, mcg.GICP())
+    for row, result in zip(table(tmp_path / "out.csv"), results, strict=True):
         np.testing.assert_array_equal(matrix(row)[:3], result.matrix[:3])

@@ -112,8 +112,9 @@ def test_a_plain_folder_is_followed(tmp_path, command):
 
 def test_frames_are_cropped_and_left_out(tmp_path, command):
     poses, map = tmp_path / "poses.txt", tmp_path / "map.ply"
-    ranges = ["--min-range", "1", "--max-range", "6", "--every", "2", "--num-frames", "2"]
-    assert command("odometry", "box-room", "--method", "gicp", *ranges, "--output", poses, "--map", map)[0] == 0
+    options = ["--min-range", "1", "--max-range", "6", "--every", "2", "--num-frames", "2", "--loops"]
+    code, text, _ = command("odometry", "box-room", "--method", "gicp", *options, "--output", poses, "--map", map)
+    assert code == 0 and "loops:     " in text
     first, second = io.read_poses(poses)
     np.testing.assert_allclose(second[:3, 3], datasets.box_room(3).path(2)[:3, 3], atol=0.03)
     distance = np.linalg.norm(io.read(map).points - np.stack([first, second])[:, None, :3, 3], axis=2).min(axis=0)

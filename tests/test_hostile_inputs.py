@@ -31,37 +31,31 @@ UTM = np.array([4.5e5, 5.2e6, 300.0])
 NAMED = re.compile("(source|target|init|points|channels|channel_valid|max_distance): ")
 
 
-def shape(kind, size, rng):
-    points = rng.normal(size=(size, 3))
-    return {
-        "room": lambda: room_corner(size, seed=int(rng.integers(100)))[0],
-        "ball": lambda: points,
-        "plane": lambda: points * [1, 1, 0],
-        "line": lambda: points[:, :1] * [1, 2, 3],
-        "axis": lambda: points * [1, 0, 0],
-        "one place": lambda: np.tile(rng.normal(size=3), (size, 1)),
-        "few places": lambda: np.resize(points[:5], (size, 3)),
-        "grid": lambda: np.rint(2 * points),
-    }[kind]()
+SHAPES = {
+    "room": lambda size, rng: room_corner(size, seed=int(rng.integers(100)))[0],
+    "ball": lambda size, rng: rng.normal(size=(size, 3)),
+    "plane": lambda size, rng: rng.normal(size=(size, 3)) * [1, 1, 0],
+    "line": lambda size, rng: rng.normal(size=(size, 1)) * [1, 2, 3],
+    "axis": lambda size, rng: rng.normal(size=(size, 1)) * [1, 0, 0],
+    "one place": lambda size, rng: np.tile(rng.normal(size=3), (size, 1)),
+    "few places": lambda size, rng: np.resize(rng.normal(size=(5, 3)), (size, 3)),
+    "grid": lambda size, rng: np.rint(rng.normal(scale=2, size=(size, 3))),
+}
+PAINTS = {
+    "noise": lambda size, rng: rng.normal(size=(size, 2)),
+    "constant": lambda size, rng: np.ones((size, 2)),
+    "one of them constant": lambda size, rng: rng.normal(size=(size, 2)) * [1, 0],
+    "NaN": lambda size, rng: np.full((size, 2), np.nan),
+    "some NaN": lambda size, rng: spoiled(rng.normal(size=(size, 2)), np.nan, 0.2, rng),
+    "huge": lambda size, rng: rng.normal(scale=1e38, size=(size, 2)),
+    "beyond float32": lambda size, rng: rng.normal(scale=1e300, size=(size, 2)),
+    "tiny": lambda size, rng: rng.normal(scale=1e-40, size=(size, 2)),
+    "integers": lambda size, rng: np.rint(rng.normal(scale=100, size=(size, 2))),
+}
 
 
 def spoiled(points, value, share, rng):
     return np.where(rng.random((len(points), 1)) < share, value, points)
-
-
-def painted(kind, size, rng):
-    channels = rng.normal(size=(size, 2))
-    return {
-        "noise": lambda: channels,
-        "constant": lambda: np.ones((size, 2)),
-        "one of them constant": lambda: channels * [1, 0],
-        "NaN": lambda: np.full((size, 2), np.nan),
-        "some NaN": lambda: spoiled(channels, np.nan, 0.2, rng),
-        "huge": lambda: 1e38 * channels,
-        "beyond float32": lambda: 1e300 * channels,
-        "tiny": lambda: 1e-40 * channels,
-        "integers": lambda: np.rint(100 * channels),
-    }[kind]()
 
 
 def frozen(array):
@@ -88,10 +82,9 @@ def clouds(draw):
     """Points and channels as a user may have them, and whether they are said where channels are missing."""
     rng = np.random.default_rng(draw(st.integers(0, 2**31)))
     size = draw(st.sampled_from([0, 1, 3, 4, 5, 20, 100, MOST]))
-    kinds = ["room", "ball", "plane", "line", "axis", "one place", "few places", "grid"]
     scale = draw(st.sampled_from([1.0, 1.0, 1.0, 1e-6, 1e-3, 1e3, 1e6, 1e-300, 1e-30, 1e18, 1e30, 1e39]))
     offset = draw(st.sampled_from([np.zeros(3), np.zeros(3), UTM, np.full(3, 1e12)]))
-    points = scale * shape(draw(st.sampled_from(kinds)), size, rng) + offset
+    points = scale * SHAPES[draw(st.sampled_from(list(SHAPES)))](size, rng) + offset
     value = draw(st.sampled_from([None, None, np.nan, np.inf, -np.inf, 0.0, 1e30, 1e200]))
     if value is not None:
         points = spoiled(points, value, draw(st.sampled_from([0.02, 0.5, 1.0])), rng)
@@ -100,8 +93,7 @@ def clouds(draw):
         points = points.astype(draw(st.sampled_from(DTYPES)))
         layout = draw(st.sampled_from(list(LAYOUTS)))
         points = LAYOUTS[layout](points) if size or layout != "list" else np.zeros((0, 3))
-    kinds = ["noise", "constant", "one of them constant", "NaN", "some NaN", "huge", "beyond float32", "tiny"]
-    values = painted(draw(st.sampled_from([*kinds, "integers"])), size, rng)
+    values = PAINTS[draw(st.sampled_from(list(PAINTS)))](size, rng)
     return points, LAYOUTS[draw(st.sampled_from(["plain", "columns", "read-only"]))](values), draw(st.booleans())
 
 

@@ -171,12 +171,6 @@ def test_the_command(room, tmp_path, command):
     assert "0.ply: no registration holds its pose (MAX_ITERATIONS)" in errors
 
 
-def test_the_command_of_odometry(tmp_path, command):
-    options = ["--num-frames", "3", "--method", "gicp", "--loops", "--map", tmp_path / "map.ply"]
-    code, text, _ = command("odometry", "box-room", *options)
-    assert code == 0 and "loops:     " in text and len(io.read(tmp_path / "map.ply")) > 1000
-
-
 @pytest.mark.parametrize(
     ("seed", "alien", "step"),
     [
