@@ -25,12 +25,12 @@ def test_numbers_are_checked(value):
 @pytest.mark.parametrize("function", [mcg.register, mcg.register_batch, mcg.odometry, mcg.multiway])
 def test_unknown_options_are_named(function):
     clouds = [POINTS] * 2
-    given = (clouds, clouds, mcg.GICP()) if function in (mcg.register, mcg.register_batch) else (clouds, mcg.GICP())
+    arguments = (clouds, clouds, mcg.GICP()) if function in (mcg.register, mcg.register_batch) else (clouds, mcg.GICP())
     # Only `register` takes tie points, and it alone does not take `voxel_size`.
     other = ("voxel_size", "average .* by preprocess") if function is mcg.register else ("tie_points", "voxel_sizes")
     for option, told in (("max_distanc", "did you mean max_distance or max_iter"), other):
         with pytest.raises(TypeError, match=rf"^{function.__name__}: .*'{option}'.*{told}"):
-            list(function(*given, **{option: None}).__iter__())
+            list(function(*arguments, **{option: None}).__iter__())
 
 
 def test_arguments_that_are_swapped_or_in_the_wrong_form_are_named():

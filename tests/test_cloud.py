@@ -91,25 +91,25 @@ def test_replaced_channels_keep_the_mask():
 @pytest.mark.parametrize("dtype", [np.float32, np.int16])
 def test_masked_arrays_keep_their_mask(dtype):
     """The data under a mask is arbitrary, often a fill value such as 9999."""
-    masked, known = np.arange(150) % 10 == 3, partial()
+    masked, measured = np.arange(150) % 10 == 3, partial()
     points, channels = (100 * POINTS).astype(dtype), (100 * CHANNELS).astype(dtype)
     coordinate = np.column_stack([np.zeros(150, bool), masked, np.zeros(150, bool)])
     hidden = np.ma.masked_array(np.where(coordinate, 9999, points).astype(dtype), coordinate)
-    values = np.ma.masked_array(channels, ~known)
+    values = np.ma.masked_array(channels, ~measured)
     cloud = PointCloud(hidden, values)
     assert cloud.points.dtype == (np.float64 if dtype == np.int16 else dtype)
     np.testing.assert_array_equal(cloud.points, np.where(coordinate, np.nan, points))
-    np.testing.assert_array_equal(cloud.channel_valid, known)
-    np.testing.assert_array_equal(cloud.channels, np.where(known, channels, 0))
+    np.testing.assert_array_equal(cloud.channel_valid, measured)
+    np.testing.assert_array_equal(cloud.channels, np.where(measured, channels, 0))
     with pytest.warns(UserWarning, match="left out 15 of 150 points"):
         assert len(preprocess(cloud, None)) == 135
     # With another mask, in a vector, in its replacement, without any masked value, and in a cloud of another library.
     both = PointCloud(points, values, channel_valid=np.ma.masked_array(np.ones((150, 2), bool), partial(1)))
-    np.testing.assert_array_equal(both.channel_valid, known & ~partial(1))
-    np.testing.assert_array_equal(PointCloud(points, values[:, 0]).channel_valid, known[:, :1])
+    np.testing.assert_array_equal(both.channel_valid, measured & ~partial(1))
+    np.testing.assert_array_equal(PointCloud(points, values[:, 0]).channel_valid, measured[:, :1])
     replaced = PointCloud(points, channels, channel_valid=~partial(1)).replace(channels=values)
-    np.testing.assert_array_equal(replaced.channel_valid, known & ~partial(1))
-    np.testing.assert_array_equal(replaced.channels, np.where(known & ~partial(1), channels, 0))
+    np.testing.assert_array_equal(replaced.channel_valid, measured & ~partial(1))
+    np.testing.assert_array_equal(replaced.channels, np.where(measured & ~partial(1), channels, 0))
     assert PointCloud(np.ma.masked_array(points), np.ma.masked_array(channels)).channel_valid is None
     np.testing.assert_array_equal(PointCloud(foreign(hidden)).points, cloud.points)
     structured = np.ma.masked_array(np.zeros(5, [(axis, dtype) for axis in "xyz"]))
@@ -145,13 +145,13 @@ def test_features_of_padded_clouds_have_the_derivatives_of_unpadded_ones():
     cloud, weights = PointCloud(POINTS + 2, np.abs(CHANNELS) + 0.5), jnp.array([0.3, -0.2, 0.1, 0.5])
     expected, gradient = jax.grad(loss)(weights, cloud), jax.grad(loss)
     batch = PointCloud.stack([cloud, cloud])
-    for found in (
+    for slopes in (
         gradient(weights, cloud.pad(200)),
         jax.jit(gradient)(weights, cloud.pad(200)),
         *jax.jit(jax.vmap(gradient, (None, 0)))(weights, batch),
         jax.jit(lambda weights, cloud: gradient(weights, cloud.pad(200)))(weights, cloud),
     ):
-        np.testing.assert_allclose(found, expected, rtol=1e-4)
+        np.testing.assert_allclose(slopes, expected, rtol=1e-4)
 
 
 def test_replace_exchanges_and_leaves_the_rest():

@@ -74,8 +74,8 @@ class Shifted(mcg.KDTreeSearch):
     ids=["missing variances", "weights", "number and type of a search"],
 )
 def test_matches_of_a_cloud_are_those_of_a_new_one(cloud, options):
-    known = np.random.default_rng(1).random(cloud.channels.shape) < 0.7
-    source, target = cloud.replace(channel_valid=known[::-1]), cloud.replace(channel_valid=known)
+    measured = np.random.default_rng(1).random(cloud.channels.shape) < 0.7
+    source, target = cloud.replace(channel_valid=measured[::-1]), cloud.replace(channel_valid=measured)
 
     def rows(source, target, option):
         options = {"method": METHOD, "max_distance": 1.0} | option
@@ -101,6 +101,6 @@ def test_rows_are_computed_once_by_threads_that_share_a_table():
     table = RowsOnDemand(compute, 20)
     wanted = [np.arange(k, k + 10) for k in (0, 5, 0, 10, 5, 3, 0, 10)]
     with ThreadPoolExecutor(len(wanted)) as threads:
-        found = list(threads.map(lambda rows: table.computed(rows)[rows], wanted))
-    np.testing.assert_array_equal(found, 10 * np.array(wanted))
+        values = list(threads.map(lambda rows: table.computed(rows)[rows], wanted))
+    np.testing.assert_array_equal(values, 10 * np.array(wanted))
     assert sorted(computed) == list(range(20))

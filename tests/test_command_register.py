@@ -134,9 +134,11 @@ def test_the_start_is_used_and_drawn(files, monkeypatch, tmp_path, register):
 
 def test_numbers_reach_the_method(register):
     numbers = ["--channel-covariance", "0.25", "--channel-weights", "0.5", "--epsilon", "0.01"]
-    for method, given in (("mc-gicp", numbers), ("color-icp", numbers[2:4])):
-        code, text, _ = register("--method", method, *given)
-        named = [f"{name[2:].replace('-', '_')} {value}" for name, value in zip(given[::2], given[1::2], strict=True)]
+    for method, options in (("mc-gicp", numbers), ("color-icp", numbers[2:4])):
+        code, text, _ = register("--method", method, *options)
+        named = [
+            f"{name[2:].replace('-', '_')} {value}" for name, value in zip(options[::2], options[1::2], strict=True)
+        ]
         assert code == 0 and ", ".join([method, *named]) + "\n" in text
 
 
@@ -308,14 +310,16 @@ def test_help_lists_the_registries(command, capsys):
 
 
 def test_a_kernel_is_an_option(register, capsys):
-    texts = [register("--method", "gicp", *given, source="bare")[1] for given in ([], ["--robust", "cauchy", "0.5"])]
+    texts = [
+        register("--method", "gicp", *options, source="bare")[1] for options in ([], ["--robust", "cauchy", "0.5"])
+    ]
     without, robust = map(printed_matrix, texts)
     assert close_to_truth(without) and close_to_truth(robust) and np.abs(without - robust).max() > 1e-6
-    for given in (["huber"], ["hubr", "1"], ["huber", "x"]):
+    for options in (["huber"], ["hubr", "1"], ["huber", "x"]):
         with pytest.raises(SystemExit):
-            register("--robust", *given)
+            register("--robust", *options)
         errors = re.sub(r"[\s│]+", " ", capsys.readouterr().err)
-        assert f"and a scale, such as huber 1.0; got {' '.join(given)} " in errors
+        assert f"and a scale, such as huber 1.0; got {' '.join(options)} " in errors
 
 
 def test_an_unwritable_cache_is_no_error(register, monkeypatch, tmp_path):

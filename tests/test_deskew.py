@@ -100,8 +100,8 @@ def errors(frames, **options):
 def test_odometry_of_a_spinning_lidar(options):
     """At 20 m/s, without deskewing stretched scans of a street are off by centimetres; the first pair counts, too."""
     frames = list(datasets.street(3, points_per_frame=8000, step=2.0, spin=True, noise=0.5))
-    smeared, found = errors(frames, **options), errors(frames, deskew=True, **options)
-    assert found.mean() < 0.5 * smeared.mean() and found.max() < 0.02
+    smeared, deskewed = errors(frames, **options), errors(frames, deskew=True, **options)
+    assert deskewed.mean() < 0.5 * smeared.mean() and deskewed.max() < 0.02
 
 
 def rooms(spin, count=12, size=600):
@@ -133,6 +133,6 @@ def test_odometry_needs_times_to_deskew_and_else_ignores_them():
     assert street.times.shape == (len(street),) and np.ptp(street.times) == 1
     timed, _ = rooms(spin=True, count=2)
     untimed = [cloud.replace(times=None) for cloud in timed]
-    poses = [[step.pose for step in mcg.odometry(each, mcg.GICP(), max_distance=1.0)] for each in (timed, untimed)]
+    poses = [[step.pose for step in mcg.odometry(clouds, mcg.GICP(), max_distance=1.0)] for clouds in (timed, untimed)]
     np.testing.assert_array_equal(*poses)
     refused(lambda: list(mcg.odometry(untimed, mcg.GICP(), deskew=True)), "frames[0]")

@@ -97,12 +97,12 @@ class Inclination(extend.AbstractFactor):
     vertical: Any
 
     def linearize(self, poses):
-        found = poses[:, 1, 2, :3]
-        x, y, z = found.T
+        measured = poses[:, 1, 2, :3]
+        x, y, z = measured.T
         jacobians = np.zeros((len(poses), 2, 3, 6))
         # T exp(ξ) turns the vertical in the sensor's frame by −ω.
         jacobians[:, 1, :, 3:] = np.moveaxis(np.array([[0 * x, -z, y], [z, 0 * x, -x], [-y, x, 0 * x]]), 2, 0)
-        return found - self.vertical, jacobians
+        return measured - self.vertical, jacobians
 
 
 def test_a_method():
@@ -124,8 +124,8 @@ def test_a_term():
 
     def balance(points):
         """The pose rests where all forces do, and has the derivative of that."""
-        found = mcg.register(source.replace(points=points), target, Prior(), max_distance=0.3).matrix
-        return jnp.sum(found[:3] * jnp.arange(12.0).reshape(3, 4))
+        matrix = mcg.register(source.replace(points=points), target, Prior(), max_distance=0.3).matrix
+        return jnp.sum(matrix[:3] * jnp.arange(12.0).reshape(3, 4))
 
     gradient = jax.grad(balance)(jnp.asarray(source.points))
     assert np.isfinite(gradient).all()
@@ -211,7 +211,7 @@ def test_a_loss():
             return extend.blockwise(feature_cost, scale, *features, total=True)
 
         arguments = jnp.asarray(source.channels), jnp.asarray(0.3)
-        with compilations() as found:
+        with compilations() as compiled:
             value, gradients = jax.value_and_grad(loss, (0, 1))(*arguments)
         expected, slopes = jax.jit(jax.value_and_grad(loss, (0, 1)))(*arguments)
         np.testing.assert_allclose(value, expected, rtol=1e-5)
@@ -219,7 +219,7 @@ def test_a_loss():
             np.testing.assert_allclose(actual, slope, rtol=1e-4, atol=1e-5 * np.abs(slope).max())
         forward = jax.jvp(loss, arguments, (gradients[0], jnp.asarray(0.0)))[1]
         np.testing.assert_allclose(forward, np.sum(gradients[0] ** 2, dtype=np.float64), rtol=1e-4)
-    assert not found
+    assert not compiled
 
 
 def test_a_loss_that_is_written_wrongly_is_refused():

@@ -235,7 +235,7 @@ def test_colours_are_written_as_others_read_them(tmp_path):
     for suffix in (".ply", ".pcd"):
         io.write(tmp_path / f"c{suffix}", cloud)
     ply, pcd = plyfile.PlyData.read(tmp_path / "c.ply"), pypcd4.PointCloud.from_path(tmp_path / "c.pcd")
-    types = {each.name: each.val_dtype for each in ply["vertex"].properties}
+    types = {column.name: column.val_dtype for column in ply["vertex"].properties}
     assert not ply.text and types == dict.fromkeys(("x", "y", "z", *INTENSITY), "f4") | dict.fromkeys(RGB, "u1")
     np.testing.assert_array_equal(np.column_stack([ply["vertex"][name] for name in RGB]), colours)
     assert pcd.fields == ("x", "y", "z", "intensity", "rgb")
@@ -262,7 +262,7 @@ def test_pcd_encodings_and_packed_colours(tmp_path, encoding, field, dtype):
 
 def pcd(fields, types, body, start=""):
     """Two points in a file; a type has a letter, a number of bytes and a number of values."""
-    sizes, letters, counts = (" ".join(each[k] for each in types.split()) for k in (1, 0, 2))
+    sizes, letters, counts = (" ".join(word[k] for word in types.split()) for k in (1, 0, 2))
     header = f"{start}FIELDS {fields}\nSIZE {sizes}\nTYPE {letters}\nCOUNT {counts}\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n"
     kind = "ascii" if body.startswith(b"1 ") else "binary"
     return f"{header}DATA {kind}\n".encode("latin-1") + body
@@ -834,9 +834,10 @@ def test_broken_poses(tmp_path):
         refused(lambda: io.read_poses(path), str(path).removesuffix(": "))
 
 
-def test_poses_that_do_not_fit(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        io.read_poses(tmp_path / "none.txt")
+def test_no_such_file_and_poses_that_do_not_fit(tmp_path):
+    for read in (io.read_poses, io.read):
+        with pytest.raises(FileNotFoundError):
+            read(tmp_path / "none.txt")
     refused(lambda: io.write_poses(tmp_path / "p.txt", np.array([np.eye(4), 2 * np.eye(4)])), "poses[1]")
     refused(lambda: io.write_poses(tmp_path / "p.txt", [np.eye(4)] * 8, timestamps=[1.0, 2.0]), "timestamps")
     assert not list(tmp_path.iterdir())

@@ -223,10 +223,10 @@ def test_warnings_name_the_cloud_and_show_the_line_of_the_caller():
     with pytest.warns(UserWarning, match="left out") as caught:
         mcg.register(*clouds, mcg.GICP(), max_distance=0.5)
         mcg.register_batch(clouds[:1], clouds[1:], mcg.GICP(), max_distance=0.5)
-    texts = [str(each.message).split(" left")[0] for each in caught]
+    texts = [str(warning.message).split(" left")[0] for warning in caught]
     assert texts == ["source:", "target:", "pair 0: source:", "pair 0: target:"]
     # Run-time checks of annotations wrap each function of the package.
-    assert all(each.filename == __file__ or "jaxtyping" in each.filename for each in caught)
+    assert all(warning.filename == __file__ or "jaxtyping" in warning.filename for warning in caught)
 
 
 OTHER_UNIT = r"points: the source extends over .* the target over .* unit"
@@ -236,15 +236,15 @@ OTHER_UNIT = r"points: the source extends over .* the target over .* unit"
 def test_different_units_of_length_are_warned_of(unit):
     """Of raw and preprocessed clouds, cells, and of one pair in a batch, which the warning names."""
     source, target = unit * room_corner(600)[0], room_corner(600, seed=1)[0]
-    ready = [mcg.preprocess(each) for each in (source, target)]
-    cells = [mcg.voxel_gaussians(each, 0.3 * size) for each, size in ((source, unit), (target, 1))]
+    ready = [mcg.preprocess(cloud) for cloud in (source, target)]
+    cells = [mcg.voxel_gaussians(cloud, 0.3 * size) for cloud, size in ((source, unit), (target, 1))]
     options = {"max_distance": 0.5, "max_iterations": 1}
     for clouds, method in (((source, target), mcg.GICP()), (ready, mcg.GICP()), (cells, mcg.D2DNDT())):
         with pytest.warns(UserWarning, match=rf"^{OTHER_UNIT}"):
             mcg.register(*clouds, method, **options)
     with pytest.warns(UserWarning, match=f"^pair 1: {OTHER_UNIT}") as caught:
         mcg.register_batch([target, ready[0]], [target, ready[1]], mcg.GICP(), **options)
-    (text,) = (str(each.message) for each in caught if "same unit" in str(each.message))
+    (text,) = (str(cloud.message) for cloud in caught if "same unit" in str(cloud.message))
     extents = [float(number) for number in re.findall(r"over (\S+) with", text)]
     assert extents == pytest.approx([np.ptp(source, axis=0).max(), np.ptp(source, axis=0).max() / unit], rel=0.2)
 
@@ -254,7 +254,7 @@ def unit_warnings(source, target):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         mcg.register(source, target, mcg.PointToPoint(), max_distance=0.5, max_iterations=1, max_source_points=100)
-    return [each for each in caught if re.search(OTHER_UNIT, str(each.message))]
+    return [warning for warning in caught if re.search(OTHER_UNIT, str(warning.message))]
 
 
 def test_clouds_of_one_unit_and_different_extents_are_not_warned_of():
@@ -288,10 +288,10 @@ def checks():
 @pytest.mark.parametrize("name", ["mc-gicp", pytest.param("photometric", marks=pytest.mark.slow)])
 def test_register_passes_under_strict_checks_of_jax(name, checks):
     (points, channels), target = (room_corner(600, seed=seed) for seed in (1, 2))
-    known = np.random.default_rng(0).random(channels.shape) < 0.8
+    measured = np.random.default_rng(0).random(channels.shape) < 0.8
     # Gradients of JAX's own functions fail under this guard.
     with jax.transfer_guard("disallow"):
-        source = mcg.PointCloud(points, channels, channel_valid=known)
+        source = mcg.PointCloud(points, channels, channel_valid=measured)
         result = mcg.register(source, mcg.PointCloud(*target), METHODS[name])
         assert np.isfinite(result.covariance).all() and np.isfinite(result.deviations).all()
 

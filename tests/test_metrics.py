@@ -136,7 +136,7 @@ def walk(rng, size, step=1.0):
 
 
 def disturbed(rng, poses, scale=0.05):
-    return np.array([each @ pose(0.01 * rng.normal(size=3), scale * rng.normal(size=3)) for each in poses])
+    return np.array([matrix @ pose(0.01 * rng.normal(size=3), scale * rng.normal(size=3)) for matrix in poses])
 
 
 @settings(max_examples=30, deadline=None)

@@ -27,8 +27,8 @@ def room():
 
 def edges_between(target, source, method, **options):
     """The result of registering two clouds, and the edges that follow from it: one or none."""
-    found = mcg.multiway([target, source], method, [(0, 1)], init=[np.eye(4)] * 2, **{"max_distance": 0.3} | options)
-    return found.registrations[0, 1], found.graph.edges
+    result = mcg.multiway([target, source], method, [(0, 1)], init=[np.eye(4)] * 2, **{"max_distance": 0.3} | options)
+    return result.registrations[0, 1], result.graph.edges
 
 
 def test_an_edge_is_what_a_registration_measured(room):
@@ -46,13 +46,13 @@ def test_an_edge_knows_next_to_nothing_of_free_directions():
     source, target, _ = pair(wall, 2000, motion((0.01, 0.01, 0.0, 0, 0, 0.01)))
     result, edges = edges_between(target, source, mcg.GICP())
     assert result.status == mcg.Status.DEGENERATE
-    constrained, twists = (np.asarray(each) for each in (result.directions.constrained, result.directions.twists))
+    constrained, twists = (np.asarray(array) for array in (result.directions.constrained, result.directions.twists))
     along = np.einsum("ki,ij,kj->k", twists, edges.information[0], twists)
     assert np.max(along[~constrained]) < 1e-2 * np.min(along[constrained])
-    channels, known = edges_between(target, source, mcg.MultiChannelGICP())
+    channels, channel_edges = edges_between(target, source, mcg.MultiChannelGICP())
     assert channels.converged
     # The variances scatter by up to 75 % with the cells in which scores are added.
-    assert np.linalg.eigvalsh(known.information[0])[0] > 30 * np.linalg.eigvalsh(edges.information[0])[0]
+    assert np.linalg.eigvalsh(channel_edges.information[0])[0] > 30 * np.linalg.eigvalsh(edges.information[0])[0]
 
 
 def test_odometry_closes_loops(room):
@@ -65,10 +65,10 @@ def test_odometry_closes_loops(room):
     i, j = (rows[graph.edges.uncertain] for rows in (graph.edges.i, graph.edges.j))
     assert len(i) >= 3 and np.all(j - i > 1) and len(np.unique(j)) == len(j)
     np.testing.assert_allclose(poses[-1], graph.poses[-1], atol=0.02)
-    errors = [metrics.ate(each, truth, alignment="first") for each in (graph.poses, plain)]
+    errors = [metrics.ate(trajectory, truth, alignment="first") for trajectory in (graph.poses, plain)]
     assert errors[0] < 0.75 * errors[1]
     # Of the last frames, also the poses that were known at their time.
-    last, before = (np.linalg.norm((each - truth)[-4:, :3, 3]) for each in (np.array(poses), plain))
+    last, before = (np.linalg.norm((trajectory - truth)[-4:, :3, 3]) for trajectory in (np.array(poses), plain))
     assert last < 0.6 * before
     # A view would keep the array of all poses in memory.
     assert all(pose.base is None for pose in poses)
@@ -94,13 +94,13 @@ def test_a_frame_that_is_lost_is_joined_by_edges_without_information(room):
 
 def test_many_clouds_get_one_map(room):
     frames, truth = room
-    found = mcg.multiway([frame.cloud for frame in frames], mcg.GICP(), max_distance=1.0)
-    assert found.converged and found.graph.kept.mean() > 0.9 and found.graph.edges.uncertain.any()
-    assert {(k, k + 1) for k in range(len(frames) - 1)} <= found.registrations.keys()
-    plain = [step.pose for step in mcg.odometry(found.clouds, mcg.GICP(), max_distance=1.0)]
-    assert metrics.ate(found.poses, truth) < metrics.ate(plain, truth)
-    np.testing.assert_allclose(found.poses[0], np.eye(4), atol=1e-12)
-    assert 0 < len(found.map) < sum(len(cloud) for cloud in found.clouds)
+    result = mcg.multiway([frame.cloud for frame in frames], mcg.GICP(), max_distance=1.0)
+    assert result.converged and result.graph.kept.mean() > 0.9 and result.graph.edges.uncertain.any()
+    assert {(k, k + 1) for k in range(len(frames) - 1)} <= result.registrations.keys()
+    plain = [step.pose for step in mcg.odometry(result.clouds, mcg.GICP(), max_distance=1.0)]
+    assert metrics.ate(result.poses, truth) < metrics.ate(plain, truth)
+    np.testing.assert_allclose(result.poses[0], np.eye(4), atol=1e-12)
+    assert 0 < len(result.map) < sum(len(cloud) for cloud in result.clouds)
 
 
 def test_pairs_are_those_of_largest_overlap_at_ever_larger_gaps():
@@ -111,9 +111,9 @@ def test_pairs_are_those_of_largest_overlap_at_ever_larger_gaps():
     # one within the others.
     poses[:, 0, 3] = [0, 0.4, 0.7, 0, 0.4, 5, 0.3, 0.5]
     # Matches so near leave the poses as they are.
-    found = mcg.multiway(clouds, mcg.PointToPoint(), init=poses, voxel_size=None, max_distance=1e-7)
+    result = mcg.multiway(clouds, mcg.PointToPoint(), init=poses, voxel_size=None, max_distance=1e-7)
     consecutive = [(k, k + 1) for k in range(7)]
-    assert found.registrations.keys() == {*consecutive, (0, 3), (1, 4), (0, 4), (4, 6), (1, 6), (4, 7), (0, 7)}
+    assert result.registrations.keys() == {*consecutive, (0, 3), (1, 4), (0, 4), (4, 6), (1, 6), (4, 7), (0, 7)}
 
 
 def test_pairs_starts_and_an_executor_can_be_given(room):
@@ -121,9 +121,9 @@ def test_pairs_starts_and_an_executor_can_be_given(room):
     clouds = [frame.cloud for frame in frames[:3]]
     with ThreadPoolExecutor(1) as threads:
         options = {"init": truth[:3], "max_distance": 1.0, "executor": threads}
-        found = mcg.multiway(clouds, mcg.GICP(), [(0, 1), (0, 2)], **options)
-    assert threads._threads and found.converged and set(found.registrations) == {(0, 1), (0, 2)}
-    np.testing.assert_allclose(found.poses[2], truth[0] @ found.registrations[0, 2].matrix, atol=1e-6)
+        result = mcg.multiway(clouds, mcg.GICP(), [(0, 1), (0, 2)], **options)
+    assert threads._threads and result.converged and set(result.registrations) == {(0, 1), (0, 2)}
+    np.testing.assert_allclose(result.poses[2], truth[0] @ result.registrations[0, 2].matrix, atol=1e-6)
     alone = mcg.multiway(clouds, mcg.GICP(), [(0, 1)], init=truth[:3], max_distance=1.0)
     assert alone.graph.status == mcg.Status.DEGENERATE
     np.testing.assert_allclose(alone.poses[2], truth[2], atol=1e-12)
@@ -132,12 +132,12 @@ def test_pairs_starts_and_an_executor_can_be_given(room):
 def test_clouds_are_preprocessed_once_and_mapped_in_voxels():
     points = np.random.default_rng(0).uniform(-1, 1, (300, 3))
     start = motion((5, 0, 0, 0, 0, 1.0))
-    found = mcg.multiway([points], mcg.GICP(), init=[start], voxel_size=0.2, num_neighbors=7)
-    assert found.converged and found.registrations == {} and found.clouds[0].neighbors.shape[1] == 7
-    expected = mcg.merge_clouds(found.clouds, [start], 0.2)
-    np.testing.assert_allclose(found.map.coordinates, expected.coordinates, atol=1e-9)
-    again = mcg.multiway(found.clouds, mcg.GICP(), init=[start], voxel_size=1.0)
-    assert again.clouds[0] is found.clouds[0] and len(again.map) < 0.3 * len(found.map)
+    result = mcg.multiway([points], mcg.GICP(), init=[start], voxel_size=0.2, num_neighbors=7)
+    assert result.converged and result.registrations == {} and result.clouds[0].neighbors.shape[1] == 7
+    expected = mcg.merge_clouds(result.clouds, [start], 0.2)
+    np.testing.assert_allclose(result.map.coordinates, expected.coordinates, atol=1e-9)
+    again = mcg.multiway(result.clouds, mcg.GICP(), init=[start], voxel_size=1.0)
+    assert again.clouds[0] is result.clouds[0] and len(again.map) < 0.3 * len(result.map)
 
 
 def test_what_is_wrong_is_named(room):
@@ -184,12 +184,12 @@ def test_the_command(room, tmp_path, command):
     ],
 )
 def test_a_cloud_of_another_place_does_not_spoil_the_motions_that_follow(seed, alien, step):
-    frames, other = (datasets.box_room(7, seed=each, points_per_frame=900, step=step) for each in (seed, seed + 1000))
+    frames, other = (datasets.box_room(7, seed=place, points_per_frame=900, step=step) for place in (seed, seed + 1000))
     clouds = [np.asarray((other if k == alien else frames)[k].cloud.points, np.float32) for k in range(7)]
-    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
+    result = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
     others = [k for k in range(7) if k != alien]
-    assert all(found.statuses[k] == mcg.Status.CONVERGED for k in others)
-    truth, poses = np.array([frames.path(k) for k in others]), found.poses[others]
+    assert all(result.statuses[k] == mcg.Status.CONVERGED for k in others)
+    truth, poses = np.array([frames.path(k) for k in others]), result.poses[others]
     np.testing.assert_allclose(np.linalg.inv(poses[0]) @ poses, np.linalg.inv(truth[0]) @ truth, atol=0.05)
 
 
@@ -201,8 +201,8 @@ def test_a_cloud_whose_registrations_contradict_each_other_is_named():
     pairs = [(i, j) for j in range(5) for i in range(j)]
     options = {"init": [np.eye(4)] * 5, "voxel_size": None, "max_distance": 0.04}
     for wanted, status in ((pairs, "DEGENERATE"), ([p for p in pairs if 2 not in p], "TOO_FEW_CORRESPONDENCES")):
-        found = mcg.multiway([near, near, bent, far, far], mcg.PointToPoint(), wanted, **options)
-        assert [each.name for each in found.statuses] == ["CONVERGED"] * 2 + [status] + ["CONVERGED"] * 2
+        result = mcg.multiway([near, near, bent, far, far], mcg.PointToPoint(), wanted, **options)
+        assert [reached.name for reached in result.statuses] == ["CONVERGED"] * 2 + [status] + ["CONVERGED"] * 2
 
 
 @pytest.mark.parametrize("seed", [0, 2, 3])
@@ -223,9 +223,9 @@ def test_far_points_cost_no_registrations():
     points = np.array(clouds[1].points)
     points[:21] = 1e8 * (1 + 0.01 * np.random.default_rng(0).random((21, 3)))
     clouds[1] = clouds[1].replace(points=points)
-    found = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
-    assert np.isfinite(found.poses).all() and len(found.registrations) >= 2
-    refused(lambda: found.map, "clouds[1]", "voxels")
+    result = mcg.multiway(clouds, mcg.GICP(), max_distance=1.0)
+    assert np.isfinite(result.poses).all() and len(result.registrations) >= 2
+    refused(lambda: result.map, "clouds[1]", "voxels")
 
 
 def test_outputs_in_the_folder_are_no_inputs(room, tmp_path, command):
@@ -255,11 +255,13 @@ def bare_corridor():
 
 @pytest.mark.parametrize("kind", ["multiway", "loops"])
 def test_poses_that_hang_on_free_directions_are_degenerate(bare_corridor, kind):
-    clouds, truth, found = bare_corridor
+    clouds, truth, result = bare_corridor
     if kind == "multiway":
-        assert all(each.status == mcg.Status.DEGENERATE for each in found.registrations.values())
-        assert [status.name for status in found.statuses] == ["CONVERGED"] + 4 * ["DEGENERATE"] and not found.converged
-        graph = found.graph
+        assert all(registration.status == mcg.Status.DEGENERATE for registration in result.registrations.values())
+        assert [status.name for status in result.statuses] == ["CONVERGED"] + 4 * [
+            "DEGENERATE"
+        ] and not result.converged
+        graph = result.graph
     else:
         *_, last = mcg.odometry(clouds, mcg.GICP(), loops=True)
         graph = mcg.optimize_poses(last.graph)
@@ -278,12 +280,12 @@ def test_poses_that_hang_on_free_directions_are_degenerate(bare_corridor, kind):
 
 
 def test_free_directions_that_other_edges_measure_are_known(bare_corridor):
-    _, truth, found = bare_corridor
+    _, truth, result = bare_corridor
     priors = mcg.Edge(np.zeros(4, int), np.arange(1, 5), truth[1:], np.tile(1e6 * np.eye(6), (4, 1, 1)))
-    known = mcg.optimize_poses(mcg.PoseGraph(found.poses, joined(found.graph.edges, priors)))
-    assert known.converged
-    np.testing.assert_allclose(known.poses, truth, atol=0.01)
-    assert np.sqrt(np.linalg.eigvalsh(known.covariance)[:, -1]).max() < 0.002
+    measured = mcg.optimize_poses(mcg.PoseGraph(result.poses, joined(result.graph.edges, priors)))
+    assert measured.converged
+    np.testing.assert_allclose(measured.poses, truth, atol=0.01)
+    assert np.sqrt(np.linalg.eigvalsh(measured.covariance)[:, -1]).max() < 0.002
 
 
 def test_the_command_says_that_poses_hang_on_free_directions(bare_corridor, tmp_path, command):
@@ -324,6 +326,6 @@ def test_a_loop_moves_the_last_pose_as_an_optimisation_of_all_would(monkeypatch)
     assert {number for _, number, _ in tries} >= {10, 19, 21}
     for i, number, distance in tries:
         rows = np.arange(number - i)
-        path = mcg.Edge(rows, rows + 1, *(np.tile(each, (len(rows), 1, 1)) for each in (step, np.diag(sigma**-2))))
+        path = mcg.Edge(rows, rows + 1, *(np.tile(matrix, (len(rows), 1, 1)) for matrix in (step, np.diag(sigma**-2))))
         variance = np.linalg.eigvalsh(mcg.optimize_poses(mcg.PoseGraph(None, path)).covariance[-1, :3, :3])[-1]
         np.testing.assert_allclose(distance, np.sqrt(chi2.ppf(0.99, 3) * variance), rtol=0.01)

@@ -120,7 +120,7 @@ def test_registrations_that_are_kept_release_their_clouds(room):
     gc.collect()
     # Those of the last two steps may be read later.
     assert [cloud() is None for cloud in alive] == [True, True, False, False, False]
-    assert all(each.value.converged for each in kept[1:])
+    assert all(registration.value.converged for registration in kept[1:])
     gc.collect()
     assert all(cloud() is None for cloud in alive)
 
@@ -178,8 +178,8 @@ def test_a_map_is_the_mean_of_each_voxel(seed, count, voxel_size, partial):
     voxels = np.floor(rows[:, :3] / voxel_size)
     made = mcg.merge_clouds(iter(clouds), iter(poses), voxel_size)
     assert len(made) == len(np.unique(voxels, axis=0)) and made.channel_names == ("a", "b")
-    known = np.ones((len(made), 2), bool) if made.channel_valid is None else made.channel_valid
-    for mean, present in zip(np.hstack([made.points, np.where(known, made.channels, np.nan)]), known, strict=True):
+    there = np.ones((len(made), 2), bool) if made.channel_valid is None else made.channel_valid
+    for mean, present in zip(np.hstack([made.points, np.where(there, made.channels, np.nan)]), there, strict=True):
         members = rows[(voxels == np.floor(mean[:3] / voxel_size)).all(axis=1)]
         np.testing.assert_array_equal(present, np.isfinite(members[:, 3:]).any(axis=0))
         measured = np.append([True] * 3, present)
@@ -219,8 +219,8 @@ def test_a_map_drifts_less():
     cells = list(mcg.odometry(many, mcg.NDT(), against="map", voxel_sizes=(0.5,), **options | {"max_distance": 1.0}))
     assert all(step.registration.converged for step in steps[1:] + cells[1:])
     to_map, by_pairs, by_cells = (
-        metrics.ate([step.pose for step in each], truth, alignment="first")
-        for each in (steps, mcg.odometry(few, mcg.GICP(), **options), cells)
+        metrics.ate([step.pose for step in trajectory], truth, alignment="first")
+        for trajectory in (steps, mcg.odometry(few, mcg.GICP(), **options), cells)
     )
     assert to_map < 0.8 * by_pairs and by_cells < 0.01
 
@@ -267,14 +267,14 @@ def test_lost_frames_are_named_and_follow_each_other(room):
 @pytest.mark.parametrize("against", ["previous", "map"])
 def test_a_jump_to_a_street_that_was_never_seen_is_lost(against):
     """Two streets have ground and house fronts in common: registration converges, with half of the overlap or more."""
-    known = datasets.street(4, points_per_frame=12_000, seed=3)
+    seen = datasets.street(4, points_per_frame=12_000, seed=3)
     elsewhere = datasets.street(60, points_per_frame=12_000, seed=13)[50]
-    clouds = [frame.cloud for frame in (*known[:3], elsewhere, known[3])]
-    steps = list(mcg.odometry(clouds, mcg.GICP(), recover=True, against=against, start=known[0].pose))
+    clouds = [frame.cloud for frame in (*seen[:3], elsewhere, seen[3])]
+    steps = list(mcg.odometry(clouds, mcg.GICP(), recover=True, against=against, start=seen[0].pose))
     assert steps[3].registration.status != mcg.Status.TOO_FEW_CORRESPONDENCES
     assert steps[3].registration.overlap > 0.6
     assert [step.lost for step in steps] == [False, False, False, True, False]
-    assert metrics.pose_error(steps[-1].pose, known[3].pose)[0] < 0.1
+    assert metrics.pose_error(steps[-1].pose, seen[3].pose)[0] < 0.1
 
 
 def test_exact_planes_are_not_lost():

@@ -217,13 +217,13 @@ def test_covariances_within_a_surface_are_drawn_as_they_are():
 
 
 def test_graphs_show_poses_and_edges(tmp_path):
-    found = mcg.optimize_poses(measured(*grid(3), false=0.2)[0])
-    figure = plot.graph(found, path=tmp_path / "graph.png")
+    graph = mcg.optimize_poses(measured(*grid(3), false=0.2)[0])
+    figure = plot.graph(graph, path=tmp_path / "graph.png")
     kept, rejected = figure.axes[0].collections
-    assert len(kept.get_segments()) == found.kept.sum() and len(rejected.get_segments()) == (~found.kept).sum() > 0
-    np.testing.assert_allclose(kept.get_array(), found.residuals[found.kept])
+    assert len(kept.get_segments()) == graph.kept.sum() and len(rejected.get_segments()) == (~graph.kept).sum() > 0
+    np.testing.assert_allclose(kept.get_array(), graph.residuals[graph.kept])
     assert (tmp_path / "graph.png").stat().st_size > 1000
     prior = mcg.Edge(mcg.WORLD, 0, np.eye(4), np.eye(6))
     lines = plot.graph(mcg.optimize_poses(mcg.PoseGraph([np.eye(4)], [prior]))).axes[0].collections
-    assert [len(each.get_segments()) for each in lines] == [1, 0]
+    assert [len(edges.get_segments()) for edges in lines] == [1, 0]
     assert len(plot.graph(mcg.optimize_poses(mcg.PoseGraph([np.eye(4)], []))).axes[0].lines) == 1

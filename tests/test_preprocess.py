@@ -252,7 +252,7 @@ def test_coarse_steps_of_coordinates_are_found(name):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         cloud = preprocess(points, None)
-    told = [str(each.message) for each in caught if "rounded" in str(each.message)]
+    told = [str(warning.message) for warning in caught if "rounded" in str(warning.message)]
     assert [float(re.search("steps of ([^ ]*) m", text)[1]) for text in told] == [step] * (step > 0)
     spacing = np.float32(0.7 * np.sqrt(60 * 60 / 3000))
     assert harmful_steps(cloud, spacing).max() == pytest.approx(step, rel=1e-4)

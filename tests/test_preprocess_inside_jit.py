@@ -37,8 +37,8 @@ def lattice():
 @pytest.mark.parametrize("search", [None, mcg.DenseSearch()], ids=["trees", "brute force"])
 @pytest.mark.parametrize("points", [surface()[0], lattice(), surface(300)[0], surface(15)[0]], ids=len)
 def test_neighbours_are_those_of_the_host(points, search):
-    found = jax.jit(partial(mcg.preprocess, voxel_size=None, search=search))(points)
-    np.testing.assert_array_equal(found.neighbors, mcg.preprocess(points, None).neighbors)
+    inside = jax.jit(partial(mcg.preprocess, voxel_size=None, search=search))(points)
+    np.testing.assert_array_equal(inside.neighbors, mcg.preprocess(points, None).neighbors)
 
 
 def test_rows_that_are_not_finite_become_padding():
@@ -49,12 +49,12 @@ def test_rows_that_are_not_finite_become_padding():
     def preprocessed(points, channels=channels):
         return mcg.preprocess(PointCloud(points, channels), None)
 
-    found, expected = jax.jit(preprocessed)(points), preprocessed(points[finite], channels[finite])
-    np.testing.assert_array_equal(found.valid, np.arange(600) < 597)
+    inside, expected = jax.jit(preprocessed)(points), preprocessed(points[finite], channels[finite])
+    np.testing.assert_array_equal(inside.valid, np.arange(600) < 597)
     for name in ("points", "channels", "neighbors"):
-        np.testing.assert_array_equal(getattr(found, name)[:597], getattr(expected, name))
+        np.testing.assert_array_equal(getattr(inside, name)[:597], getattr(expected, name))
     # Features of padding are finite.
-    np.testing.assert_array_equal(found.points[597:], np.broadcast_to(expected.points[-1], (3, 3)))
+    np.testing.assert_array_equal(inside.points[597:], np.broadcast_to(expected.points[-1], (3, 3)))
     slopes = jax.jit(jax.grad(lambda points: jnp.sum(preprocessed(points).points[:597] ** 2)))(points)
     assert np.isfinite(slopes).all() and (slopes[~finite] == 0).all()
     nothing = jax.jit(preprocessed)(np.full_like(points, np.nan))
@@ -72,23 +72,23 @@ averaged_inside = jax.jit(averaged, static_argnums=3)
 def test_means_of_voxels():
     points, channels = surface()
     measured = np.random.default_rng(1).random(channels.shape) < 0.7
-    found = averaged_inside(points, channels, measured)
-    assert found.channel_valid.dtype == bool and found.points.dtype == found.channels.dtype == np.float32
+    inside = averaged_inside(points, channels, measured)
+    assert inside.channel_valid.dtype == bool and inside.points.dtype == inside.channels.dtype == np.float32
     order, numbers, count = map(np.asarray, jax.jit(_voxels_of)(points, np.ones(len(points), bool), VOXEL))
-    assert np.sum(found.valid) == count == numbers.max() + 1
+    assert np.sum(inside.valid) == count == numbers.max() + 1
     for number in range(count):
         rows = order[numbers == number]
-        np.testing.assert_allclose(found.points[number], points[rows].mean(axis=0), atol=1e-6)
+        np.testing.assert_allclose(inside.points[number], points[rows].mean(axis=0), atol=1e-6)
         # Edges of a voxel are that long.
         assert np.ptp(points[rows], axis=0).max() < np.sqrt(3) * VOXEL
-        for channel, (values, known) in enumerate(zip(channels[rows].T, measured[rows].T, strict=True)):
-            assert found.channel_valid[number, channel] == known.any()
-            if known.any():
-                np.testing.assert_allclose(found.channels[number, channel], values[known].mean(), atol=1e-6)
+        for channel, (values, present) in enumerate(zip(channels[rows].T, measured[rows].T, strict=True)):
+            assert inside.channel_valid[number, channel] == present.any()
+            if present.any():
+                np.testing.assert_allclose(inside.channels[number, channel], values[present].mean(), atol=1e-6)
     # As many as on the host, in a grid that is turned otherwise.
     assert count == pytest.approx(len(mcg.preprocess(points, VOXEL)), rel=0.1)
-    expected = mcg.preprocess(found.points[:count], None)
-    np.testing.assert_array_equal(found.neighbors[:count], expected.neighbors)
+    expected = mcg.preprocess(inside.points[:count], None)
+    np.testing.assert_array_equal(inside.neighbors[:count], expected.neighbors)
     # Too many voxels leave no valid row.
     assert not np.any(averaged_inside(points, channels, measured, 100).valid)
 
@@ -111,8 +111,8 @@ def test_derivatives_of_means():
 
     @jax.jit
     def weighed(points, channels):
-        found = averaged(points, channels, mask)
-        return jnp.sum(weights * jnp.where(found.valid[:, None], jnp.hstack([found.points, found.channels]), 0))
+        inside = averaged(points, channels, mask)
+        return jnp.sum(weights * jnp.where(inside.valid[:, None], jnp.hstack([inside.points, inside.channels]), 0))
 
     jax.test_util.check_grads(weighed, (points, channels), order=1, eps=1e-6, atol=1e-7, rtol=1e-7)
 
@@ -125,8 +125,8 @@ def test_from_raw_points_to_a_loss_under_vmap():
     def loss(source, target, offset):
         ready = [mcg.preprocess(points, 0.05, size=2048) for points in (source + offset, target)]
         result = mcg.register(*ready, mcg.GICP(), max_distance=0.5)
-        apart = jnp.linalg.inv(truth) @ result.T_target_source.as_matrix()
-        return jnp.sum(apart[:3, 3] ** 2), result.status_code
+        error = jnp.linalg.inv(truth) @ result.T_target_source.as_matrix()
+        return jnp.sum(error[:3, 3] ** 2), result.status_code
 
     offsets = np.array([[0.0, 0, 0], [0.02, -0.01, 0.01]], np.float32)
     (values, statuses), slopes = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True), (None, None, 0)))(
@@ -152,7 +152,7 @@ def test_what_is_missing_is_said():
 
 
 def test_the_size_of_a_concrete_cloud():
-    found, whole = averaged(*surface()), mcg.preprocess(PointCloud(*surface()), VOXEL)
-    assert found.points.shape[0] == SIZE and len(found) == len(whole)
-    np.testing.assert_array_equal(found.points[: len(whole)], whole.points)
+    sized, whole = averaged(*surface()), mcg.preprocess(PointCloud(*surface()), VOXEL)
+    assert sized.points.shape[0] == SIZE and len(sized) == len(whole)
+    np.testing.assert_array_equal(sized.points[: len(whole)], whole.points)
     refused(lambda: averaged(*surface(), size=100), "size", len(whole), 100)

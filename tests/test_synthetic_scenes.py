@@ -118,7 +118,7 @@ def test_the_room_is_closed_and_its_points_are_on_its_walls_and_boxes(seed):
 
 
 def test_noise_along_the_rays_keeps_their_directions():
-    clean, free, along = (box_room(1, **each)[0].cloud.points for each in ({"noise": 0.0}, {}, {"along_rays": True}))
+    clean, free, along = (box_room(1, **noise)[0].cloud.points for noise in ({"noise": 0.0}, {}, {"along_rays": True}))
     directions = clean / np.linalg.norm(clean, axis=1, keepdims=True)
     across = [np.linalg.norm(np.cross(points - clean, directions), axis=1).mean() for points in (free, along)]
     assert across[0] > 0.01 and across[1] < 1e-12

@@ -32,8 +32,8 @@ def even(count=3000, noise=0.0, seed=0):
 def extents(points, k=20):
     """Brute force: the three extents of the k nearest points of some points, the largest first."""
     points = np.asarray(points, float)
-    some = points[:: max(len(points) // 400, 1)]
-    rows = np.argsort(((some[:, None] - points) ** 2).sum(-1), axis=1)[:, :k]
+    sample = points[:: max(len(points) // 400, 1)]
+    rows = np.argsort(((sample[:, None] - points) ** 2).sum(-1), axis=1)[:, :k]
     offsets = points[rows] - points[rows].mean(axis=1, keepdims=True)
     return np.linalg.svd(offsets, compute_uv=False).T
 
@@ -60,10 +60,10 @@ def test_points_that_are_spread_evenly_are_kept():
     assert cloud.voxel_size is None and "voxels" not in repr(cloud)
     np.testing.assert_array_equal(cloud.points, raw.astype(np.float32))
     # As are clouds with covariances, small ones and planar scans.
-    given = mcg.PointCloud(lines(), covariances=np.tile(np.eye(3), (len(lines()), 1, 1)))
+    with_covariances = mcg.PointCloud(lines(), covariances=np.tile(np.eye(3), (len(lines()), 1, 1)))
     angle = np.linspace(0, 2 * np.pi, 1081)
     planar = np.stack([5 * np.cos(angle), 3 * np.sin(angle), np.zeros(1081)], axis=1)
-    assert all(mcg.preprocess(cloud).voxel_size is None for cloud in (given, lines()[:499], planar))
+    assert all(mcg.preprocess(cloud).voxel_size is None for cloud in (with_covariances, lines()[:499], planar))
     for wrong in ("large", 0.0, -1.0, (1.0,), float("nan")):
         refused(lambda wrong=wrong: mcg.preprocess(raw, wrong), "voxel_size")
 
@@ -140,15 +140,15 @@ def test_one_size_for_a_sequence_and_its_map():
     assert {step.cloud.voxel_size for step in steps} == {mcg.preprocess(frames[0]).voxel_size}
     world = mcg.merge_clouds([step.cloud for step in steps], [step.pose for step in steps])
     assert world.voxel_size == steps[0].cloud.voxel_size
-    found = mcg.multiway(frames, mcg.PointToPlane())
-    assert len({cloud.voxel_size for cloud in found.clouds} | {found.voxel_size}) == 1
+    result = mcg.multiway(frames, mcg.PointToPlane())
+    assert len({cloud.voxel_size for cloud in result.clouds} | {result.voxel_size}) == 1
 
 
 def test_raw_clouds_of_cells_keep_all_points():
     target, source = datasets.box_room(2, seed=3, points_per_frame=2000)
-    given = mcg.register(source.cloud, target.cloud, mcg.NDT(), voxel_sizes=(0.5,))
+    result = mcg.register(source.cloud, target.cloud, mcg.NDT(), voxel_sizes=(0.5,))
     cells = mcg.voxel_gaussians(target.cloud, 0.5)
-    np.testing.assert_array_equal(given.matrix, mcg.register(source.cloud, cells, mcg.NDT()).matrix)
+    np.testing.assert_array_equal(result.matrix, mcg.register(source.cloud, cells, mcg.NDT()).matrix)
 
 
 def test_the_size_survives_what_users_do_with_clouds():
@@ -185,8 +185,8 @@ def test_neighbours_are_found_when_they_are_used():
     assert sum(asked) < 0.5 * 2 * len(raw)
     whole = mcg.KDTreeSearch().neighbors(np.asarray(clouds[0].points), 20)
     sent = pickle.loads(pickle.dumps(mcg.preprocess(raw)))
-    for each in (clouds[0], sent, jax.tree.map(lambda leaf: leaf, clouds[1])):
-        np.testing.assert_array_equal(each.neighbors, whole)
+    for cloud in (clouds[0], sent, jax.tree.map(lambda leaf: leaf, clouds[1])):
+        np.testing.assert_array_equal(cloud.neighbors, whole)
     assert not clouds[0].neighbors.flags.writeable
     # By default, ten thousand points are matched.
     assert mcg.register(*clouds, mcg.GICP()).num_inliers == 10_000
