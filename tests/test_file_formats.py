@@ -834,10 +834,13 @@ def test_broken_poses(tmp_path):
         refused(lambda: io.read_poses(path), str(path).removesuffix(": "))
 
 
-def test_no_such_file_and_poses_that_do_not_fit(tmp_path):
+def test_no_such_file(tmp_path):
     for read in (io.read_poses, io.read):
         with pytest.raises(FileNotFoundError):
             read(tmp_path / "none.txt")
+
+
+def test_poses_that_do_not_fit(tmp_path):
     refused(lambda: io.write_poses(tmp_path / "p.txt", np.array([np.eye(4), 2 * np.eye(4)])), "poses[1]")
     refused(lambda: io.write_poses(tmp_path / "p.txt", [np.eye(4)] * 8, timestamps=[1.0, 2.0]), "timestamps")
     assert not list(tmp_path.iterdir())
