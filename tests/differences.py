@@ -93,6 +93,12 @@ def assert_slopes(gradient, expected, floor=1e-3, accuracy=1e-6):
         assert abs(actual - difference) <= accuracy * max(abs(difference), floor), f"{name}[{leaf}]"
 
 
+def assert_alike(actual, expected, accuracy):
+    """Trees of arrays agree, relative to the largest number of each."""
+    for one, other in zip(*map(jax.tree.leaves, (actual, expected)), strict=True):
+        np.testing.assert_allclose(one, other, atol=accuracy * np.abs(other).max())
+
+
 def check_gradient(loss, inputs):
     """Compare the gradient with differences of values outside of transformations; return the compiled gradient."""
     compiled = jax.jit(jax.grad(loss))
