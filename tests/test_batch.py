@@ -48,20 +48,17 @@ def test_every_option_of_register_is_one_of_a_batch(raw):
 
 @pytest.mark.slow
 def test_raw_clouds_are_prepared_by_the_workers(raw):
-    results = batch([pair[0] for pair in raw], [pair[1] for pair in raw], voxel_size=0.1, num_neighbors=12)
-    expected = [
-        mcg.register(*(mcg.preprocess(cloud, 0.1, 12) for cloud in pair[:2]), METHOD, max_distance=0.5) for pair in raw
-    ]
-    assert_same(results, expected)
+    sources, targets = [[pair[side] for pair in raw] for side in (0, 1)]
+    ready = [[mcg.preprocess(cloud, 0.1, 12) for cloud in side] for side in (sources, targets)]
+    assert_same(batch(sources, targets, voxel_size=0.1, num_neighbors=12), batch(*ready))
 
 
-@pytest.mark.parametrize("num_workers", [1, 2, 5])
-def test_order_and_number_of_workers_change_nothing(raw, alone, num_workers):
-    order = np.random.default_rng(num_workers).permutation(len(raw))
-    sources, targets = prepared(raw)
-    with ThreadPoolExecutor(num_workers) as threads:
-        results = batch([sources[i] for i in order], [targets[i] for i in order], executor=threads)
-    assert_same(results, [alone[i] for i in order])
+def test_order_and_number_of_workers_change_nothing(raw, alone):
+    order = np.random.default_rng(0).permutation(len(raw))
+    sides = [[side[i] for i in order] for side in prepared(raw)]
+    for num_workers in (1, 5):
+        with ThreadPoolExecutor(num_workers) as threads:
+            assert_same(batch(*sides, executor=threads), [alone[i] for i in order])
 
 
 SPOILED = {
@@ -124,12 +121,11 @@ def test_pairs_without_overlap_or_far_from_rest_have_the_status_of_register(raw,
 
 
 def test_one_target_for_all(raw):
-    sources, targets = prepared(raw)
-    expected = [mcg.register(source, targets[0], METHOD, max_distance=0.5) for source in sources]
-    assert_same(batch(sources, targets[0]), expected)
+    (*sources,), (target, *_) = prepared(raw[:3])
+    expected = batch(sources, [target] * 3)
+    assert_same(batch(sources, target), expected)
     assert_same(batch(sources, raw[0][1]), expected)
-    backward = [mcg.register(targets[0], source, METHOD, max_distance=0.5) for source in sources[:2]]
-    assert_same(batch(targets[0], sources[:2]), backward)
+    assert_same(batch(target, sources), batch([target] * 3, sources))
     points = np.random.default_rng(0).normal(size=(60, 3))
     table = np.rec.fromarrays(points.T, names="x,y,z")
     results = mcg.register_batch([points + 0.01, points - 0.01], table, mcg.PointToPoint())
@@ -137,11 +133,11 @@ def test_one_target_for_all(raw):
 
 
 def test_starts_for_all_or_for_each(raw):
-    sources, targets = (side[:3] for side in prepared(raw))
+    sources, targets = prepared(raw[:3])
     starts = np.stack([motion(0.01 * np.arange(6) * i) for i in range(3)])
     expected = [
-        mcg.register(source, target, METHOD, init=start, max_distance=0.5)
-        for source, target, start in zip(sources, targets, starts, strict=True)
+        mcg.register(*clouds, METHOD, init=start, max_distance=0.5)
+        for *clouds, start in zip(sources, targets, starts, strict=True)
     ]
     assert_same(batch(sources, targets, init=starts), expected)
     assert_same(batch(sources, targets, init=iter(starts)), expected)
@@ -150,21 +146,13 @@ def test_starts_for_all_or_for_each(raw):
 
 def test_iterators_are_consumed_as_needed(raw):
     """Never many more pairs are held than there are workers."""
-    sources, targets = prepared(raw)
-    taken, most = 0, 0
-
-    def clouds():
-        nonlocal taken
-        for _ in range(60):
-            taken += 1
-            yield sources[0]
-
-    for finished, _ in enumerate(
-        mcg.register_as_completed(clouds(), targets[0], mcg.PointToPoint(), max_distance=0.5, max_iterations=1)
-    ):
-        most = max(most, taken - finished)
-    assert taken == 60
-    assert most <= 4 * os.cpu_count() + 4
+    (source,), (target,) = prepared(raw[:1])
+    taken, held = [], []
+    sources = (taken.append(1) or source for _ in range(60))
+    options = {"max_distance": 0.5, "max_iterations": 1}
+    for finished, _ in enumerate(mcg.register_as_completed(sources, target, mcg.PointToPoint(), **options)):
+        held.append(len(taken) - finished)
+    assert len(held) == 60 and max(held) <= 4 * os.cpu_count() + 4
 
 
 def test_functions_that_make_clouds_are_called_by_the_workers(raw, alone):
@@ -174,16 +162,9 @@ def test_functions_that_make_clouds_are_called_by_the_workers(raw, alone):
         threads.append(threading.current_thread())
         return cloud
 
-    def missing():
-        raise FileNotFoundError(2, "No such file", "scan.ply")
-
-    sources = [partial(make, pair[0]) for pair in raw]
-    sources[1] = missing
-    with pytest.warns(UserWarning, match=r"pair 1: source: .*scan\.ply"):
-        results = batch(sources, [pair[1] for pair in raw])
-    assert results[1].status is Status.INVALID_INPUT
-    assert threading.main_thread() not in threads and len(threads) == len(raw) - 1
-    assert_same(results[2:], alone[2:])
+    sources, targets = [partial(make, pair[0]) for pair in raw], [pair[1] for pair in raw]
+    assert_same(batch(sources, targets), alone)
+    assert threading.main_thread() not in threads and len(threads) == len(raw)
 
 
 class Elsewhere(Executor):
@@ -200,19 +181,29 @@ class Elsewhere(Executor):
         return future
 
 
-@pytest.mark.parametrize("error", [KeyError("scan"), SystemExit("scan")], ids=["error", "exit"])
-def test_any_error_of_a_function_is_the_reason_of_its_pair(error, raw, alone):
+PLACE = rf"\({re.escape(__file__)}, line \d+\)"
+
+
+@pytest.mark.parametrize(
+    "error, reason",
+    [
+        pytest.param(KeyError("scan"), f"KeyError: 'scan' {PLACE}", id="error"),
+        pytest.param(SystemExit("scan"), f"SystemExit: scan {PLACE}", id="exit"),
+        pytest.param(FileNotFoundError(2, "No such file", "scan.ply"), r".*scan\.ply", id="file"),
+    ],
+)
+def test_any_error_of_a_function_is_the_reason_of_its_pair(error, reason, raw, alone):
     calls = []
 
     def broken():
         calls.append(None)
         raise error
 
-    sources, targets = prepared(raw)
+    sources, targets = prepared(raw[:3])
+    sources[1] = broken
     for executor in (None, Elsewhere()):
-        reason = rf"pair 1: source: {type(error).__name__}: '?scan'? \({re.escape(__file__)}, line \d+\)"
-        with pytest.warns(mcg.PairWarning, match=reason) as caught:
-            results = batch([sources[0], broken, sources[2]], targets[:3], executor=executor)
+        with pytest.warns(mcg.PairWarning, match=f"pair 1: source: {reason}") as caught:
+            results = batch(sources, targets, executor=executor)
         assert len(caught) == len(calls) == 1 and results[1].status is Status.INVALID_INPUT
         assert_same([results[0], results[2]], [alone[0], alone[2]])
         calls.clear()
@@ -258,8 +249,7 @@ def test_sides_that_do_not_fit(raw):
 
 
 def test_everything_survives_pickle_and_deepcopy(raw, alone):
-    cloud = mcg.preprocess(raw[0][0])
-    for thing in (cloud, raw[0][0], METHOD, alone[0], mcg.KDTreeSearch(1), mcg.Huber(1.0)):
+    for thing in (mcg.preprocess(raw[0][0]), raw[0][0], METHOD, alone[0], mcg.KDTreeSearch(1), mcg.Huber(1.0)):
         for twin in (pickle.loads(pickle.dumps(thing)), copy.deepcopy(thing)):
             assert type(twin) is type(thing)
             assert_same([twin], [thing])
@@ -302,25 +292,24 @@ def test_workers_leave_the_filters_of_warnings_alone(raw, monkeypatch):
 @pytest.mark.parametrize("search", [None, mcg.DenseSearch()])
 def test_a_batch_starts_from_anywhere(search):
     """A room seen from afar, another room, and ten points; with threads and with lanes."""
-    frames = datasets.box_room(2, points_per_frame=4000)
+    target, source = datasets.box_room(2, points_per_frame=4000)
     away = motion((3, -2, 1, 1.0, 2.0, -0.5))
     other = datasets.box_room(1, points_per_frame=4000, seed=1)[0].cloud
-    noise = np.random.default_rng(0).normal(size=(10, 3))
-    sources = [frames[1].cloud.transform(away), other, noise]
-    truth = np.linalg.inv(frames[0].pose) @ frames[1].pose @ np.linalg.inv(away)
+    sources = [source.cloud.transform(away), other, np.random.default_rng(0).normal(size=(10, 3))]
     options = {"init": "global", "max_distance": 0.5}
     with pytest.warns(mcg.PairWarning) as caught:
-        found, unsure, lost = mcg.register_batch(sources, frames[0].cloud, mcg.GICP(), search=search, **options)
+        right, unsure, lost = mcg.register_batch(sources, target.cloud, mcg.GICP(), search=search, **options)
     messages = sorted(str(warning.message).split(" (")[0].split(",")[0] for warning in caught)
     assert messages == ["pair 1: global pose: too little evidence", "pair 2: global pose: none found"]
-    assert found.converged and mcg.metrics.pose_error(found.matrix, truth)[0] < 0.05
+    truth = np.linalg.inv(target.pose) @ source.pose @ np.linalg.inv(away)
+    assert right.converged and pose_error(right.matrix, truth)[0] < 0.05
     assert unsure.status is Status.UNVERIFIED and not unsure.converged and np.isfinite(unsure.matrix).all()
     assert lost.status is Status.TOO_FEW_CORRESPONDENCES and np.isnan(lost.matrix[:3]).all()
     if search is None:
-        alone = mcg.register(mcg.preprocess(sources[0]), mcg.preprocess(frames[0].cloud), mcg.GICP(), **options)
-        np.testing.assert_array_equal(found.matrix, alone.matrix)
+        alone = mcg.register(*map(mcg.preprocess, (sources[0], target.cloud)), mcg.GICP(), **options)
+        np.testing.assert_array_equal(right.matrix, alone.matrix)
     with pytest.warns(mcg.PairWarning, match="pair 0: init: "):
-        mcg.register_batch(sources[:1], frames[0].cloud, mcg.GICP(), init=["local"])
+        mcg.register_batch(sources[:1], target.cloud, mcg.GICP(), init=["local"])
 
 
 def test_inside_transformations_a_batch_says_what_to_use(raw):

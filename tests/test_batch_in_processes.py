@@ -83,27 +83,14 @@ def pids_in(folder):
 
 
 def test_processes_take_over_where_they_pay(raw, tmp_path, pays, caplog, monkeypatch):
+    """Of an iterator, too, whose length is not known."""
     (source,), (target,) = prepared(raw[:1])
     monkeypatch.setattr(batch_executors.LOGGER, "disabled", False)
     with caplog.at_level(logging.INFO, "mcgicp_jax"):
-        results = batch(in_turn(tmp_path, source, 500), target)
+        results = batch(iter(in_turn(tmp_path, source, 500)), iter([target] * 500))
     assert_same(results, 500 * batch([source], target, executor="threads"))
     assert os.getpid() in pids_in(tmp_path) and len(pids_in(tmp_path)) == 1 + num_cores()
     assert f"{num_cores()} processes start" in caplog.text
-
-
-def test_processes_take_over_from_an_iterator_of_any_length(raw, tmp_path, pays):
-    (source,), (target,) = prepared(raw[:1])
-    found = mcg.register_as_completed(iter(in_turn(tmp_path, source, 500)), target, METHOD, max_distance=0.5)
-    assert sorted(index for index, _ in found) == list(range(500))
-    assert len(pids_in(tmp_path)) == 1 + num_cores()
-
-
-def test_threads_go_on_where_processes_do_not_pay(raw, tmp_path, monkeypatch):
-    (source,), (target,) = prepared(raw[:1])
-    monkeypatch.setattr(Processes, "are_warm", False)
-    batch(in_turn(tmp_path, source, 20), target)
-    assert pids_in(tmp_path) == {os.getpid()}
 
 
 @pytest.mark.parametrize("sendable", [0, 1000])
@@ -111,8 +98,7 @@ def test_what_cannot_be_sent_stays_at_home(raw, tmp_path, pays, sendable):
     """All pairs, or those after the processes have started."""
     (source,), (target,) = prepared(raw[:1])
     functions = in_turn(tmp_path, source, sendable) + in_turn(tmp_path, source, 40, threading.Lock())
-    results = batch(functions, target)
-    assert all(result.converged for result in results)
+    assert all(result.converged for result in batch(functions, target))
     assert (len(pids_in(tmp_path)) > 1) == (sendable > 0)
 
 
@@ -127,12 +113,12 @@ def test_the_time_of_the_caller_is_not_that_of_the_pairs(raw, tmp_path, monkeypa
             time.sleep(1.0)
             yield function
 
-    for turn in (slow(), functions):
+    for turn, pause in ((slow(), 0.0), (functions, 1.0)):
         # Enough pairs for several answers; each would seem to take a second.
         completed = mcg.register_as_completed(turn, target, METHOD, max_distance=0.5)
         for _ in range(2 * num_cores() + 4):
             next(completed)
-            time.sleep(0 if turn is not functions else 1.0)
+            time.sleep(pause)
         completed.close()
     assert pids_in(tmp_path) == {os.getpid()}
 
@@ -165,8 +151,7 @@ def test_a_worker_starts_no_processes(raw, tmp_path, pays):
 
     def inside():
         batch_executors._PAYS = 0.0
-        results = batch(in_turn(tmp_path, source, 60), target)
-        return all(result.converged for result in results)
+        return all(result.converged for result in batch(in_turn(tmp_path, source, 60), target))
 
     assert told(inside) == "True" and len(pids_in(tmp_path)) == 1
 
@@ -200,15 +185,6 @@ def test_a_pair_that_ends_its_workers_is_given_up_alone(raw, alone):
     assert_same(results[:2] + results[3:], alone[:2] + alone[3:])
 
 
-def test_a_pair_without_enough_memory_is_given_up_alone(raw, alone):
-    sources, targets = prepared(raw)
-    sources[2] = lambda: np.ones(10**14)
-    with pytest.warns(mcg.PairWarning, match="^pair 2: source: MemoryError: Unable to allocate") as caught:
-        results = in_processes(sources, targets)
-    assert len(caught) == 1 and results[2].status is Status.INVALID_INPUT
-    assert_same(results[:2] + results[3:], alone[:2] + alone[3:])
-
-
 def test_what_cannot_be_sent_is_named(raw):
     sources, targets = prepared(raw)
     lock = threading.Lock()
@@ -217,13 +193,10 @@ def test_what_cannot_be_sent_is_named(raw):
         in_processes(sources, targets)
 
 
-@pytest.mark.parametrize("clouds", ["raw", "prepared", "far"])
-def test_gradients_are_those_of_threads(raw, clouds):
+@pytest.mark.parametrize("offset", [0, np.array([4e5, 5e6, 0])], ids=["near", "far"])
+def test_gradients_are_those_of_threads(raw, offset):
     """Poses and Jacobians to the last bit; a gradient adds the rows of the Jacobian in another order."""
-    sources, targets = prepared(raw) if clouds == "prepared" else ([pair[side] for pair in raw] for side in (0, 1))
-    if clouds == "far":
-        offset = np.array([4e5, 5e6, 0])
-        sources, targets = ([each.replace(points=each.points + offset) for each in side] for side in (sources, targets))
+    sources, targets = ([pair[side].replace(points=pair[side].points + offset) for pair in raw[:3]] for side in (0, 1))
     sources[2], weights = np.zeros((3, 3)), np.random.default_rng(0).normal(size=7)
 
     def poses(points, executor, pose="T_target_source"):

@@ -1,6 +1,7 @@
 """The photometric term: residuals, estimates, gradients, and what it does for a pose."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,7 +15,17 @@ from mcgicp_jax._local_geometry.sensor_patterns import without_constant_part
 from mcgicp_jax._pose_solver.matched import Matched, adapted, sample_of_term
 from mcgicp_jax._terms.photometric import Photometric, Residuals
 from mcgicp_jax.extend import AbstractTerm, Mahalanobis
-from tests.differences import CONVERGED, GATE, TO_ROUNDING, check_eager_gradient, clouds_with, inputs_of, weigh
+from tests.compilations import solves_single_matrices
+from tests.differences import (
+    CONVERGED,
+    GATE,
+    TO_ROUNDING,
+    assert_alike,
+    check_eager_gradient,
+    clouds_with,
+    inputs_of,
+    weigh,
+)
 from tests.precision import in_float64, tolerance
 from tests.scenes import matched_at, motion, pair, wall
 
@@ -101,28 +112,21 @@ def test_a_wall_of_sharp_edges_is_constrained(seed, method, largest):
 
 
 @pytest.mark.slow
-def test_batches_on_accelerators_find_the_same_pose():
-    source, target, _ = pair(wall, 400, truth=SMALL)
-    alone = mcg.register(source, target, PHOTOMETRIC)
-    (batched,) = mcg.register_batch([source], [target], PHOTOMETRIC, search=mcg.DenseSearch())
-    np.testing.assert_allclose(batched.matrix, alone.matrix, atol=1e-5)
-    np.testing.assert_allclose(batched.covariance, alone.covariance, rtol=0.1, atol=0.05 * alone.covariance.max())
-
-
-@pytest.mark.slow
 def test_transformations_find_the_same_pose():
     """Also of channels with a gain and an offset, which are estimated there too."""
     source, target, _ = pair(wall, 900, truth=SMALL)
     source = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
     options = {"equalize_channels": True, "search": mcg.DenseSearch()}
     outside = mcg.register(source, target, PHOTOMETRIC, **options)
-    inside = jax.jit(lambda s, t: mcg.register(s, t, PHOTOMETRIC, **options))(source, target.pad(1024))
+    clouds = source, target.pad(1024)
+    program = jax.jit(lambda *clouds: mcg.register(*clouds, PHOTOMETRIC, **options)).lower(*clouds)
+    assert solves_single_matrices(program)
+    inside = program.compile()(*clouds)
     np.testing.assert_allclose(inside.matrix, outside.matrix, atol=2e-6)
     assert inside.status == outside.status and inside.num_iterations == outside.num_iterations
-    np.testing.assert_allclose(
-        inside.information, outside.information, rtol=1e-2, atol=1e-3 * outside.information.max()
-    )
-    np.testing.assert_allclose(inside.covariance, outside.covariance, rtol=0.05, atol=0.02 * outside.covariance.max())
+    for name, rtol, atol in (("information", 1e-2, 1e-3), ("covariance", 0.05, 0.02)):
+        actual, expected = getattr(inside, name), getattr(outside, name)
+        np.testing.assert_allclose(actual, expected, rtol=rtol, atol=atol * expected.max())
 
 
 @pytest.mark.slow
@@ -153,20 +157,6 @@ def test_forces_are_the_gradient_of_the_cost():
     change = jax.jit(lambda moved: jax.jvp(lambda moved: of(moved, "force"), (moved,), (axis,))[1])(moved)
     stiffness = jax.jit(lambda moved: of(moved, "stiffness"))(moved)
     np.testing.assert_allclose(np.sum(stiffness[0]), -np.sum(change[0]), rtol=0.15)
-
-
-def test_gains_and_offsets_apply_to_values_and_slopes():
-    source, target, truth, matches = at_truth()
-    _, term = with_fixed_numbers(source, target, PHOTOMETRIC, truth, matches)
-    darker = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
-    brighter = replace(term, gains=term.gains / 0.7, offsets=term.offsets + 0.2 / 0.7)
-    samples = []
-    for cloud, each in ((source, term), (darker, brighter)):
-        matched, _, motion = matched_at(cloud, target, PHOTOMETRIC, truth, matches)
-        samples.append(sampled(each, matched, motion))
-    for name in ("values", "slopes", "products"):
-        expected, found = (np.asarray(getattr(each, name)) for each in samples)
-        np.testing.assert_allclose(found, expected, atol=1e-3 * np.nanmax(np.abs(expected)), err_msg=name)
 
 
 @pytest.mark.slow
@@ -233,53 +223,35 @@ def test_noise_of_slopes_is_discounted(noise):
     normals, products = np.tile([0, 0, 1.0], (40_000, 1)), np.sum(here * there, axis=1, keepdims=True)
     slopes = np.stack([normals, (here + there) / 2], axis=1)
     designs = photometric(0.002).adapt(Residuals(values, slopes, values[:, 1:], products, moved), 1.0).designs
-    reliability = 1 / (1 + noise**2 / 2)
-    np.testing.assert_allclose(designs[0] / designs[1], reliability, rtol=0.15, atol=0.03)
+    np.testing.assert_allclose(designs[0] / designs[1], 1 / (1 + noise**2 / 2), rtol=0.15, atol=0.03)
 
 
-@pytest.mark.slow
 @in_float64
-def test_estimate_pose_has_the_gradient_of_its_answer(noisy):
-    """With its numbers fixed, as they are for autodiff."""
-    source, target, start = noisy
+@pytest.mark.slow
+def test_gradients_are_those_of_estimate_pose_at_the_same_matches():
+    """With the numbers of the term that they lead to: its scales are constants to autodiff."""
+    source, target, _ = pair(size=400, noise=0.02, channel_noise=0.02)
+    options = {"max_distance": GATE, **CONVERGED}
+    result = mcg.register(source, target, PHOTOMETRIC, **options)
+    assert result.converged
+    start = result.matrix
     matches = mcg.find_correspondences(source, target, start, mcg.PointToPoint(), max_distance=GATE)
     method, _ = with_fixed_numbers(source, target, PHOTOMETRIC, start, matches)
-    start = mcg.estimate_pose(source, target, matches, method, init=start, **TO_ROUNDING).matrix
 
-    def loss(inputs):
+    def registered(inputs, search=None):
         clouds = clouds_with(inputs, source, target)
-        return weigh(mcg.estimate_pose(*clouds, matches, method, init=start, **TO_ROUNDING).matrix)
+        return weigh(mcg.register(*clouds, PHOTOMETRIC, init=start, search=search, **options).matrix)
 
-    inputs = inputs_of(source, target, method, None)
-    inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
-    check_eager_gradient(loss, inputs)
+    def estimated(inputs):
+        return weigh(
+            mcg.estimate_pose(*clouds_with(inputs, source, target), matches, method, init=start, **TO_ROUNDING).matrix
+        )
 
-
-@in_float64
-@pytest.mark.slow
-def test_register_has_the_gradient_of_estimate_pose():
-    """At the same matches, with the numbers of the term that they lead to."""
-    source, target, _ = pair(size=400, noise=0.02, channel_noise=0.02)
-    found = mcg.register(source, target, PHOTOMETRIC, max_distance=GATE, **CONVERGED)
-    assert found.converged
-    matches = mcg.find_correspondences(source, target, found.matrix, mcg.PointToPoint(), max_distance=GATE)
-    method, _ = with_fixed_numbers(source, target, PHOTOMETRIC, found.matrix, matches)
-
-    def registered(clouds):
-        return mcg.register(*clouds, PHOTOMETRIC, init=found.matrix, max_distance=GATE, **CONVERGED)
-
-    def estimated(clouds):
-        return mcg.estimate_pose(*clouds, matches, method, init=found.matrix, **TO_ROUNDING)
-
-    inputs = inputs_of(source, target, method, None)
-    inputs = {name: value for name, value in inputs.items() if name not in ("method", "robust")}
-    actual, expected = (
-        jax.jit(jax.grad(lambda inputs, of=of: weigh(of(clouds_with(inputs, source, target)).matrix)))(inputs)
-        for of in (registered, estimated)
-    )
-    for name, gradient in expected.items():
-        assert np.abs(gradient).max() > 0
-        np.testing.assert_allclose(actual[name], gradient, atol=1e-6 * np.abs(gradient).max(), err_msg=name)
+    inputs = {name: value for name, value in inputs_of(source, target, None, None).items() if value is not None}
+    expected = check_eager_gradient(estimated, inputs)
+    assert all(np.abs(gradient).max() > 0 for gradient in expected.values())
+    assert_alike(jax.grad(registered)(inputs), expected, 1e-6)
+    assert_alike(jax.jit(jax.grad(partial(registered, search=mcg.DenseSearch())))(inputs), expected, 1e-6)
 
 
 @pytest.mark.slow

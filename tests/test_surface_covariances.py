@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mcgicp_jax import GICP, MultiChannelGICP, PointCloud, preprocess
-from mcgicp_jax._local_geometry.local_geometry import weighted_covariance
 from tests import reference as ref
 from tests import scenes
 from tests.precision import cached, in_both_precisions, in_float64, tolerance
@@ -21,8 +20,7 @@ REGULARISATION = 1e-6
 @cached
 def cloud_of(num_points, num_channels):
     points, channels = ref.scene(num_points, num_channels, seed=num_channels)
-    cloud = preprocess(PointCloud(points, channels), num_neighbors=K)
-    return cloud.pad(num_points + 10)
+    return preprocess(PointCloud(points, channels), num_neighbors=K).pad(num_points + 10)
 
 
 @cached
@@ -117,15 +115,6 @@ def test_channels_without_contrast_make_covariances_of_gicp(channels):
     np.testing.assert_allclose(*compiled, rtol=0, atol=8 * np.finfo(dtype()).eps)
 
 
-def test_covariances_turn_with_the_cloud():
-    """Which orthonormal tangent basis was chosen cannot be seen from outside."""
-    R = ref.rotation(np.random.default_rng(0).normal(size=3) * 2)
-    cloud = cloud_of(600, 3)
-    method = MultiChannelGICP(full_lambda(3), 0.1, EPSILON)
-    turned = cloud.replace(points=jnp.asarray(np.asarray(cloud.points, float) @ R.T, cloud.points.dtype))
-    compare(covariances(method, turned), R @ covariances(method, cloud) @ R.T, 5e-4, 1e-9)
-
-
 @pytest.mark.parametrize("floor", [1e-4, 1e-2, 0.3])
 def test_eigenvalues_in_the_plane_are_at_least_min_eigenvalue(floor):
     """Every point unlike all others: Ω would be 0, the covariance singular."""
@@ -180,8 +169,7 @@ def awkward(kind):
         points = points + np.array([3e3, -2e3, 1e3])
     elif kind == "wild channels":
         channels = channels * 10.0 ** rng.integers(-15, 15, size=channels.shape)
-    cloud = preprocess(PointCloud(points, channels), num_neighbors=K)
-    return cloud.pad(160)
+    return preprocess(PointCloud(points, channels), num_neighbors=K).pad(160)
 
 
 AWKWARD = [
@@ -201,8 +189,7 @@ def test_awkward_neighbourhoods_stay_finite_in_value_and_gradient(kind):
     assert np.isfinite(value)
     for gradient in gradients:
         assert np.isfinite(gradient).all()
-    method = MultiChannelGICP(0.3 * np.eye(3), 0.1, EPSILON)
-    values = np.linalg.eigvalsh(covariances(method, cloud))
+    values = np.linalg.eigvalsh(covariances(MultiChannelGICP(0.3 * np.eye(3), 0.1, EPSILON), cloud))
     assert values.min() > 0.5 * EPSILON
     assert values.max() < 10
 
@@ -310,16 +297,3 @@ def test_channels_without_noise_are_given_some():
     covariance, weights, *_ = numbers_for(cloud, cloud)
     np.testing.assert_allclose(covariance, 2 * (1.5e-3 * np.std(points[:, 0])) ** 2, rtol=1e-3)
     assert np.all(weights > 0)
-
-
-def test_weighted_covariance_is_that_of_numpy():
-    """At a size at which jaxlib 0.10.2 miscompiled the reduction over stacked coordinates."""
-    rng = np.random.default_rng(0)
-    offsets, weights = rng.normal(size=(3, 20, 2000)), rng.random((20, 2000))
-    found = jax.jit(weighted_covariance)(
-        tuple(jnp.asarray(each, float) for each in offsets), jnp.asarray(weights, float)
-    )
-    centred = offsets - np.average(offsets, axis=1, weights=np.broadcast_to(weights, offsets.shape))[:, None]
-    expected = np.einsum("aki,bki,ki->iab", centred, centred, weights) / weights.sum(axis=0)[:, None, None]
-    np.testing.assert_allclose(expected[0], np.cov(offsets[:, :, 0], aweights=weights[:, 0], ddof=0), rtol=1e-12)
-    np.testing.assert_allclose(ref.symmetric(found), expected, atol=tolerance(1e-5, 1e-12))

@@ -81,19 +81,18 @@ def test_cells_of_one_colour():
 
 def test_missing_channels():
     points, channels = room_corner(4000)
-    known = points[:, 0] > 0.5
-    cloud = mcg.PointCloud(points, channels, channel_valid=np.repeat(known[:, None], 2, axis=1))
-    cells = extend.voxel_cells(cloud, SIZE)
-    found = mcg.voxel_gaussians(cloud, SIZE)
-    for i in range(len(found)):
-        inside = (cells == i) & known
-        assert np.all(found.channel_valid[i] == inside.any())
+    measured = points[:, 0] > 0.5
+    cloud = mcg.PointCloud(points, channels, channel_valid=np.repeat(measured[:, None], 2, axis=1))
+    numbers, cells = extend.voxel_cells(cloud, SIZE), mcg.voxel_gaussians(cloud, SIZE)
+    for i in range(len(cells)):
+        inside = (numbers == i) & measured
+        assert np.all(cells.channel_valid[i] == inside.any())
         if inside.any():
-            np.testing.assert_allclose(found.channels[i], channels[inside].mean(axis=0), rtol=1e-5)
+            np.testing.assert_allclose(cells.channels[i], channels[inside].mean(axis=0), rtol=1e-5)
     # Split by channels, the points of a cell have or lack the same ones.
     split = extend.voxel_cells(cloud, SIZE, channel_size=100.0)
-    assert any(len(set(known[cells == i])) == 2 for i in range(cells.max() + 1))
-    assert all(len(set(known[split == i])) == 1 for i in range(split.max() + 1))
+    most, split_most = (max(len(set(measured[rows == i])) for i in range(rows.max() + 1)) for rows in (numbers, split))
+    assert most == 2 and split_most == 1
 
 
 def test_means_of_covariances():
@@ -126,15 +125,11 @@ def test_moments_in_jax():
     points, channels = room_corner(3000)
     cloud = mcg.PointCloud(points, channels)
     cells, expected = extend.voxel_cells(cloud, SIZE), mcg.voxel_gaussians(cloud, SIZE, min_ratio=0.1)
-    dtype = expected.points.dtype
     moments = partial(extend.cell_moments, cells=cells, min_ratio=0.1)
-    atol = tolerance(2e-6, 1e-12)
-    for each in (jax.jit(moments), moments):
-        means, values, covariances = each(points.astype(dtype), channels.astype(dtype))
-        assert means.dtype == covariances.dtype == dtype
-        np.testing.assert_allclose(means, expected.points, atol=atol)
-        np.testing.assert_allclose(values, expected.channels, atol=atol)
-        np.testing.assert_allclose(covariances, expected.covariances, atol=atol)
+    for function in (jax.jit(moments), moments):
+        for found, name in zip(function(points, channels), ("points", "channels", "covariances"), strict=True):
+            assert found.dtype == expected.points.dtype
+            np.testing.assert_allclose(found, getattr(expected, name), atol=1e-12)
 
 
 @in_float64
@@ -168,8 +163,7 @@ def test_moments_of_what_is_no_array_of_points_are_refused_by_name():
 @in_float64
 def test_gradients_of_moments_compile_nothing_for_another_size():
     def loss(points, channels, cells):
-        parts = extend.cell_moments(points, channels, cells)
-        return sum(jnp.sum(jnp.sin(3 * part)) for part in parts)
+        return sum(jnp.sum(jnp.sin(3 * part)) for part in extend.cell_moments(points, channels, cells))
 
     gradient = jax.value_and_grad(loss, argnums=(0, 1))
     for size in (900, 1100):
@@ -184,27 +178,23 @@ def test_gradients_of_moments_compile_nothing_for_another_size():
 
 @pytest.mark.slow
 @in_float64
-@pytest.mark.parametrize("name", ["ndt", "d2d-ndt"])
-def test_gradients_reach_the_points(name):
-    source, target, start = raw_pair()
-    method = {"ndt": mcg.NDT(), "d2d-ndt": mcg.D2DNDT()}[name]
-    cells, moments = [], []
-    for cloud in (source, target):
-        cells.append(mcg.voxel_gaussians(cloud, SIZE))
-        number = extend.voxel_cells(cloud, SIZE)
-        of_cells = partial(extend.cell_moments, channels=cloud.channels, cells=number)
-        moments.append(jax.jit(of_cells) if cloud is source else of_cells)
-    matches = mcg.find_correspondences(*cells, start, method, max_distance=GATE)
+@pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT], ids=["ndt", "d2d-ndt"])
+def test_gradients_reach_the_points(method):
+    *clouds, start = raw_pair()
+    cells = [mcg.voxel_gaussians(cloud, SIZE) for cloud in clouds]
+    numbers = [extend.voxel_cells(cloud, SIZE) for cloud in clouds]
+    matches = mcg.find_correspondences(*cells, start, method(), max_distance=GATE)
+    # Those of the source inside `jit`, those of the target outside.
+    functions = jax.jit(partial(extend.cell_moments, cells=numbers[0])), partial(extend.cell_moments, cells=numbers[1])
 
     def loss(inputs):
-        clouds = []
-        for side, gaussians, moments_of in zip(("source", "target"), cells, moments, strict=True):
-            means, channels, spread = moments_of(inputs[side])
-            clouds.append(gaussians.replace(points=means, channels=channels, covariances=spread))
-        return weigh(mcg.estimate_pose(*clouds, matches, inputs["method"], init=start, **TO_ROUNDING).matrix)
+        moved = []
+        for i, moments in enumerate(functions):
+            means, channels, spread = moments(inputs["points"][i], clouds[i].channels)
+            moved.append(cells[i].replace(points=means, channels=channels, covariances=spread))
+        return weigh(mcg.estimate_pose(*moved, matches, inputs["method"], init=start, **TO_ROUNDING).matrix)
 
-    inputs = {"source": jnp.asarray(source.points), "target": jnp.asarray(target.points), "method": method}
-    check_eager_gradient(loss, inputs)
+    check_eager_gradient(loss, {"points": [jnp.asarray(cloud.points) for cloud in clouds], "method": method()})
 
 
 @pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT, lambda: mcg.ColorNDT(0.1)], ids=["ndt", "d2d-ndt", "colour"])
@@ -222,13 +212,11 @@ def test_voxel_sizes_make_the_cells(raw):
     source, target, truth = raw
     far = motion((0.15, -0.1, 0.1, 0.05, -0.05, 0.1))
     moved = source.transform(np.linalg.inv(far))
-    thinned = mcg.preprocess(moved, 0.05)
-    for moving, method in ((moved, mcg.D2DNDT()), (thinned, mcg.NDT())):
+    thinned, cells = mcg.preprocess(moved, 0.05), mcg.voxel_gaussians(target, SIZE)
+    for moving, end, method in ((moved, mcg.voxel_gaussians(moved, SIZE), mcg.D2DNDT()), (thinned, thinned, mcg.NDT())):
         result = mcg.register(moving, target, method, voxel_sizes=(0.8, SIZE))
         assert result.converged and max(pose_error(result.matrix, truth @ far)) < 0.03
         # The last size is the result.
-        cells = mcg.voxel_gaussians(target, SIZE)
-        end = mcg.voxel_gaussians(moved, SIZE) if isinstance(method, mcg.D2DNDT) else thinned
         again = mcg.register(end, cells, method, init=result.matrix)
         np.testing.assert_allclose(again.matrix, result.matrix, atol=1e-3)
         assert again.num_inliers == result.num_inliers
@@ -238,8 +226,7 @@ def test_coarse_sizes_register_voxels_of_a_quarter(raw):
     voxels, cells = (
         [make(cloud, size) for cloud in raw[:2]] for make, size in ((mcg.preprocess, 0.2), (mcg.voxel_gaussians, SIZE))
     )
-    coarse = mcg.register(*voxels, mcg.GICP())
-    expected = mcg.register(*cells, mcg.D2DNDT(), init=coarse.matrix)
+    expected = mcg.register(*cells, mcg.D2DNDT(), init=mcg.register(*voxels, mcg.GICP()).matrix)
     found = mcg.register(*raw[:2], mcg.D2DNDT(), voxel_sizes=(0.8, SIZE))
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 
@@ -264,13 +251,11 @@ def test_views_that_overlap_in_part_are_not_pulled_over_each_other(method):
 
 @pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT], ids=["ndt", "d2d-ndt"])
 def test_the_unit_of_length_does_not_matter(method, raw):
-    source, target, _ = raw
-    results = []
-    for unit in (1.0, 1000.0):
-        clouds = [mcg.voxel_gaussians(mcg.PointCloud(unit * cloud.points), unit * SIZE) for cloud in (source, target)]
-        results.append(mcg.register(*clouds, method()).matrix)
-    results[1][:3, 3] /= 1000.0
-    np.testing.assert_allclose(results[0], results[1], atol=tolerance(2e-5, 1e-9))
+    metres, millimetres = (
+        mcg.register(*(mcg.voxel_gaussians(unit * cloud.points, unit * SIZE) for cloud in raw[:2]), method()).matrix
+        for unit in (1.0, 1000.0)
+    )
+    np.testing.assert_allclose(metres[:3], millimetres[:3] / [1, 1, 1, 1000], atol=tolerance(2e-5, 1e-9))
 
 
 def cells_of(raw):
@@ -283,25 +268,24 @@ def test_the_cost_is_the_sum_over_the_nearest_cells(raw):
     source, target = cells_of(raw)
     method, gate = mcg.D2DNDT(2.0), 3 * SIZE
     pose = motion((0.06, -0.02, 0.03, 0.03, -0.02, 0.04))
-    moved = np.asarray(source.points, float) @ pose[:3, :3].T + pose[:3, 3]
-    distances = np.linalg.norm(moved[:, None] - target.points, axis=2)
+    residuals = target.points - (np.asarray(source.points, float) @ pose[:3, :3].T + pose[:3, 3])[:, None]
+    distances = np.linalg.norm(residuals, axis=2)
     rows = np.argsort(distances, axis=1)[:, :4]
     cost, square = 0.0, 0.0
-    for i in range(len(moved)):
+    for i in range(len(source)):
         near = [j for j in rows[i] if distances[i, j] <= gate]
         for j in near:
-            d = target.points[j] - moved[i]
             spread = target.covariances[j] + pose[:3, :3] @ source.covariances[i] @ pose[:3, :3].T
-            cost += 4 * (1 - np.exp(-d @ np.linalg.solve(spread, d) / 4))
-        square += np.mean([distances[i, j] ** 2 for j in near])
+            cost += 4 * (1 - np.exp(-residuals[i, j] @ np.linalg.solve(spread, residuals[i, j]) / 4))
+        square += np.mean(distances[i, near] ** 2)
     matches = mcg.find_correspondences(source, target, pose, method, max_distance=gate)
     np.testing.assert_array_equal(np.sort(matches.indices.T, axis=1), np.sort(rows, axis=1))
     rtol = tolerance(1e-3, 1e-9)
     np.testing.assert_allclose(mcg.mahalanobis_cost(pose, source, target, matches, method), cost, rtol=rtol)
     result = mcg.register(source, target, method, init=pose, max_distance=gate, max_iterations=1)
     np.testing.assert_allclose(result.history["cost"][0], cost, rtol=rtol)
-    np.testing.assert_allclose(result.history["rmse"][0], np.sqrt(square / len(moved)), rtol=rtol)
-    assert result.history["num_inliers"][0] == len(moved) and result.overlap <= 1
+    np.testing.assert_allclose(result.history["rmse"][0], np.sqrt(square / len(source)), rtol=rtol)
+    assert result.history["num_inliers"][0] == len(source) and result.overlap <= 1
 
 
 def test_the_sum_is_more_accurate_than_the_nearest_cell():
@@ -327,50 +311,44 @@ def test_colours_are_the_same_inside_jit(raw):
 @pytest.mark.slow
 def test_the_sum_is_the_same_everywhere(raw):
     """On the host, inside `jit`, in batches, in lanes, and in the alignment to its final matches."""
-    source, target = cells_of(raw)
-    method, atol = mcg.D2DNDT(), tolerance(1e-4, 1e-9)
-    alone = mcg.register(source, target, method, max_distance=1.0)
+    clouds, method, atol = cells_of(raw), mcg.D2DNDT(), tolerance(1e-4, 1e-9)
+    alone = mcg.register(*clouds, method, max_distance=1.0)
     dense = {"max_distance": 1.0, "search": mcg.DenseSearch()}
-    inside = jax.jit(lambda a, b: mcg.register(a, b, method, **dense))(source, target)
+    inside = jax.jit(lambda *clouds: mcg.register(*clouds, method, **dense))(*clouds)
     np.testing.assert_allclose(inside.matrix, alone.matrix, atol=atol)
     np.testing.assert_allclose(inside.covariance, alone.covariance, rtol=tolerance(0.05, 1e-6), atol=1e-9)
-    lanes = mcg.register_batch([source] * 2, target, method, **dense)
-    for result in (*mcg.register_batch([source], target, method, max_distance=1.0), *lanes):
+    lanes = mcg.register_batch(clouds[:1] * 2, clouds[1], method, **dense)
+    for result in (*mcg.register_batch(clouds[:1], clouds[1], method, max_distance=1.0), *lanes):
         np.testing.assert_allclose(result.matrix, alone.matrix, atol=atol)
         assert result.num_inliers == alone.num_inliers
-    matches = mcg.find_correspondences(source, target, alone.matrix, method, max_distance=1.0)
-    again = mcg.estimate_pose(source, target, matches, method, init=alone.matrix)
+    matches = mcg.find_correspondences(*clouds, alone.matrix, method, max_distance=1.0)
+    again = mcg.estimate_pose(*clouds, matches, method, init=alone.matrix)
     np.testing.assert_allclose(again.matrix, alone.matrix, atol=1e-3)
-    refused(lambda: mcg.estimate_pose(source, target, matches, mcg.NDT()), "temperature", 4)
+    refused(lambda: mcg.estimate_pose(*clouds, matches, mcg.NDT()), "temperature", 4)
 
 
 def test_colours_hold_what_geometry_does_not():
     source, target, truth = raw_pair(wall, 8000, motion((0.02, -0.015, 0.0, 0.0, 0.0, 0.01)))
-    cells = mcg.voxel_gaussians(target, 0.2, channel_size=1.0)
-    colour = mcg.register(source, cells, mcg.ColorNDT(0.2))
+    colour = mcg.register(source, mcg.voxel_gaussians(target, 0.2, channel_size=1.0), mcg.ColorNDT(0.2))
     assert colour.converged and max(pose_error(colour.matrix, truth)) < 0.01
-    plain = mcg.register(source, mcg.voxel_gaussians(target, SIZE), mcg.NDT())
-    assert plain.status == mcg.Status.DEGENERATE
+    assert mcg.register(source, mcg.voxel_gaussians(target, SIZE), mcg.NDT()).status == mcg.Status.DEGENERATE
 
 
 def test_what_is_wrong_is_named(raw):
     source, target, _ = raw
     cells = mcg.voxel_gaussians(target, SIZE)
-    for named, shown, moving, fixed, method, options in (
-        ("target", "NDT", source, target, mcg.NDT(), {}),
-        ("source", "D2DNDT", source, cells, mcg.D2DNDT(), {}),
-        ("voxel_sizes", "covariances", source, cells, mcg.NDT(), {"voxel_sizes": (1.0,)}),
-        ("target: voxel_size", "4 cells of 6 points", source, target, mcg.NDT(), {"voxel_sizes": (1e-3,)}),
+    for named, shown, moving, fixed, method, sizes in (
+        ("target", "NDT", source, target, mcg.NDT(), ()),
+        ("source", "D2DNDT", source, cells, mcg.D2DNDT(), ()),
+        ("voxel_sizes", "covariances", source, cells, mcg.NDT(), (1.0,)),
+        ("target: voxel_size", "4 cells of 6 points", source, target, mcg.NDT(), (1e-3,)),
     ):
-        refused(lambda c=(moving, fixed, method), o=options: mcg.register(*c, **o), named, shown)
-    for name, *values in (
-        ("voxel_size", -1.0, np.nan),
-        ("min_points", 2),
-        ("min_ratio", 2.0),
-        ("channel_size", 0.0, [1.0, 2.0, 3.0]),
+        refused(lambda c=(moving, fixed, method), s=sizes: mcg.register(*c, voxel_sizes=s), named, shown)
+    for name, value in (
+        *(("voxel_size", -1.0), ("voxel_size", np.nan), ("min_points", 2), ("min_ratio", 2.0)),
+        *(("channel_size", 0.0), ("channel_size", [1.0, 2.0, 3.0])),
     ):
-        for value in values:
-            refused(lambda given={name: value}: mcg.voxel_gaussians(target, **{"voxel_size": SIZE} | given), name)
+        refused(lambda given={name: value}: mcg.voxel_gaussians(target, **{"voxel_size": SIZE} | given), name)
     traced = jax.jit(lambda points: mcg.voxel_gaussians(target.replace(points=points), SIZE).points)
     refused(lambda: traced(target.points), "cloud", "concrete")
 
