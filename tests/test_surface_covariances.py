@@ -146,36 +146,26 @@ def weighted_sum(points, channels, channel_covariance, epsilon, cloud, weights):
 weighted_sum_and_gradients = jax.jit(jax.value_and_grad(weighted_sum, argnums=(0, 1, 2, 3)))
 
 
+AWKWARD = {
+    "collinear along an axis": lambda points: points * [1, 0, 0],
+    "collinear": lambda points: points[:, :1] * [0.3, -0.5, 0.81],
+    "coincident": lambda points: 0 * points + [1, 2, 3],
+    "half coincident": lambda points: np.where(np.arange(150)[:, None] < 75, points[0], points),
+    "flat": lambda points: points * [1, 1, 0],
+    "isotropic": lambda _: np.concatenate([radius * np.eye(3) for radius in range(-25, 26) if radius]),
+    "fewer than k": lambda points: points[:7],
+    "four points": lambda points: points[:4],
+    "far": lambda points: np.add(points, [3e3, -2e3, 1e3]),
+    "wild channels": lambda points: points,
+}
+
+
 def awkward(kind):
-    rng = np.random.default_rng(0)
     points, channels = ref.scene(150, 3, seed=3)
-    if kind == "collinear along an axis":
-        points[:, 1:] = 0
-    elif kind == "collinear":
-        points = points[:, :1] * np.array([[0.3, -0.5, 0.81]])
-    elif kind == "coincident":
-        points[:] = [1.0, 2.0, 3.0]
-    elif kind == "half coincident":
-        points[:75] = points[0]
-    elif kind == "flat":
-        points[:, 2] = 0
-    elif kind == "isotropic":
-        points = np.concatenate([sign * radius * np.eye(3) for sign in (1, -1) for radius in range(1, 26)])
-    elif kind == "fewer than k":
-        points, channels = points[:7], channels[:7]
-    elif kind == "four points":
-        points, channels = points[:4], channels[:4]
-    elif kind == "far":
-        points = points + np.array([3e3, -2e3, 1e3])
-    elif kind == "wild channels":
-        channels = channels * 10.0 ** rng.integers(-15, 15, size=channels.shape)
-    return preprocess(PointCloud(points, channels), num_neighbors=K).pad(160)
-
-
-AWKWARD = [
-    *("collinear along an axis", "collinear", "coincident", "half coincident", "flat", "isotropic"),
-    *("fewer than k", "four points", "far", "wild channels"),
-]
+    points = AWKWARD[kind](points)
+    if kind == "wild channels":
+        channels = channels * 10.0 ** np.random.default_rng(0).integers(-15, 15, size=channels.shape)
+    return preprocess(PointCloud(points, channels[: len(points)]), num_neighbors=K).pad(160)
 
 
 @in_both_precisions
