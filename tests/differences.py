@@ -9,7 +9,7 @@ import numpy as np
 import mcgicp_jax as mcg
 
 GATE = 0.4
-CASES = ("mc-gicp", "gicp", "point-to-plane", "point-to-point", "color-icp")
+METHODS = ("mc-gicp", "gicp", "point-to-plane", "point-to-point", "color-icp")
 
 
 def case(name):

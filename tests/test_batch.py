@@ -133,10 +133,8 @@ def test_one_target_for_all(raw):
 def test_starts_for_all_or_for_each(raw):
     sources, targets = prepared(raw[:3])
     starts = np.stack([motion(0.01 * np.arange(6) * i) for i in range(3)])
-    expected = [
-        mcg.register(*clouds, METHOD, init=start, max_distance=0.5)
-        for *clouds, start in zip(sources, targets, starts, strict=True)
-    ]
+    cases = zip(sources, targets, starts, strict=True)
+    expected = [mcg.register(*clouds, METHOD, init=start, max_distance=0.5) for *clouds, start in cases]
     assert_same(batch(sources, targets, init=starts), expected)
     assert_same(batch(sources, targets, init=iter(starts)), expected)
     assert_same(batch(sources[1:2], targets[1:2], init=starts[1]), expected[1:2])

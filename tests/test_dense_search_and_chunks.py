@@ -60,20 +60,16 @@ def test_neighbors_far_from_the_origin_lose_nothing():
     np.testing.assert_array_equal(DenseSearch().neighbors(points, 5), KDTreeSearch().neighbors(points, 5))
 
 
-@pytest.mark.parametrize("lacking", ["source", "target", "both"])
+@pytest.mark.parametrize("lacking", [(True, False), (False, True), (True, True)])
 def test_channels_that_are_not_there_add_what_they_would_on_average(lacking):
-    rng = np.random.default_rng(0)
-    source, target = rng.random((40, 3)), rng.random((50, 3))
-    channels, penalty = (rng.random((40, 2)), rng.random((50, 2))), np.array([0.02, 0.1])
-    masks = [rng.random((40, 2)) < 0.5, rng.random((50, 2)) < 0.5]
-    clouds = []
-    for side, points, values, missing in zip(("source", "target"), (source, target), channels, masks, strict=True):
-        if lacking not in (side, "both"):
-            missing[:] = False
-        clouds.append(rows(points, values, penalty=np.where(missing, penalty, 0) if missing.any() else None))
-    expected = ref.match_partial(
-        np.hstack([source, channels[0]]), np.hstack([target, channels[1]]), ~masks[0], ~masks[1], penalty, 3
-    )
+    rng, penalty, clouds, plain, masks = np.random.default_rng(0), np.array([0.02, 0.1]), [], [], []
+    for size, lacks in zip((40, 50), lacking, strict=True):
+        points, channels, missing = rng.random((size, 3)), rng.random((size, 2)), rng.random((size, 2)) < 0.5
+        missing &= lacks
+        clouds.append(rows(points, channels, penalty=np.where(missing, penalty, 0) if lacks else None))
+        plain.append(np.hstack([points, channels]))
+        masks.append(~missing)
+    expected = ref.match_partial(*plain, *masks, penalty, 3)
     np.testing.assert_array_equal(query(DenseSearch(), *clouds, 3).T, expected)
 
 

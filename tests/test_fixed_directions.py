@@ -46,9 +46,8 @@ def test_fixed_directions_are_those_of_the_prior(name):
     # Where the prior and the start are wrong, what is fixed is that of the prior.
     prior = truth @ motion(np.array([0.02, -0.01, 0.015, 0.01, -0.015, 0.02]))
     start = truth @ motion((0.05, 0.05, -0.05, 0.03, 0.03, -0.05))
-    result = mcg.register(
-        source, target, mcg.GICP(), init=start, prior=(prior, covariance_fixing(CASES[name])), **OPTIONS
-    )
+    given = prior, covariance_fixing(CASES[name])
+    result = mcg.register(source, target, mcg.GICP(), init=start, prior=given, **OPTIONS)
     assert result.converged
     twist = remaining(result.matrix, prior)
     assert np.abs(twist[fixed]).max() < 1e-6
@@ -215,10 +214,9 @@ def test_errors_of_the_free_directions_have_the_deviations():
 def test_a_planar_scan_from_far_off(data, fixed, variance):
     """One beam of a LiDAR, without heights, on a whole cloud, in the plane that the prior knows; the start is off by a
     metre and 20°."""
-    source, target = (
-        np.asarray(mcg.io.read(data / "lidar_pair" / f"{name}.ply").points) for name in ("source", "target")
-    )
-    truth = np.loadtxt(data / "lidar_pair" / "T_target_source.txt")
+    folder = data / "lidar_pair"
+    source, target = (np.asarray(mcg.io.read(folder / f"{name}.ply").points) for name in ("source", "target"))
+    truth = np.loadtxt(folder / "T_target_source.txt")
     ranges = np.linalg.norm(source[:, :2], axis=1)
     beam = source[(np.hypot(ranges, source[:, 2]) > 0.5) & (np.abs(np.degrees(np.arctan2(source[:, 2], ranges))) < 0.2)]
     clouds = mcg.preprocess((beam * [1, 1, 0])[:: len(beam) // 316], None), mcg.preprocess(target)

@@ -18,6 +18,7 @@ from mcgicp_jax import Status
 from tests.compilations import compilations
 from tests.differences import (
     GATE,
+    METHODS,
     TO_ROUNDING,
     assert_alike,
     assert_slopes,
@@ -73,9 +74,7 @@ def soft_mc_gicp():
     return mcg.MultiChannelGICP([[0.05, 0.01], [0.01, 0.08]], [0.3, 0.2], epsilon=1e-2), mcg.Cauchy(0.5)
 
 
-HARD_CASES = {
-    name: Case(partial(case, name)) for name in ("mc-gicp", "gicp", "point-to-plane", "point-to-point", "color-icp")
-}
+HARD_CASES = {name: Case(partial(case, name)) for name in METHODS}
 CASES = HARD_CASES | {
     "covariances": Case(partial(case, "gicp"), changed=with_covariances),
     "soft mc-gicp": Case(soft_mc_gicp, 4),
@@ -110,11 +109,9 @@ class Problem:
 
     def aligned(self, inputs):
         """From elsewhere, to the matches at the start."""
-        options = {name: inputs[name] for name in ("robust", "temperature") if name in inputs}
+        options = TO_ROUNDING | {name: inputs[name] for name in ("robust", "temperature") if name in inputs}
         clouds = clouds_with(inputs, *self.clouds)
-        return weigh(
-            mcg.estimate_pose(*clouds, self.matches, inputs["method"], init=motion(), **TO_ROUNDING, **options).matrix
-        )
+        return weigh(mcg.estimate_pose(*clouds, self.matches, inputs["method"], init=motion(), **options).matrix)
 
 
 problem_of = cached(Problem)

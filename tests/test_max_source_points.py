@@ -120,9 +120,8 @@ def test_gradients_agree_with_differences(clouds, method):
     start = mcg.register(source, target, method, **options)
 
     def loss(inputs):
-        return weigh(
-            mcg.register(*clouds_with(inputs, source, target), inputs["method"], init=start.matrix, **options).matrix
-        )
+        moved = clouds_with(inputs, source, target)
+        return weigh(mcg.register(*moved, inputs["method"], init=start.matrix, **options).matrix)
 
     inputs = inputs_of(source, target, method, None)
     gradient = check_eager_gradient(loss, inputs)

@@ -65,18 +65,14 @@ def test_many_equal_distances(seed, k):
     """Zeros for what a sensor did not see, and a sphere about one point: more than any lattice has."""
     rng = np.random.default_rng(seed)
     sphere = np.array([x for x in np.ndindex(21, 21, 21) if np.sum((np.array(x) - 10) ** 2) == 81]) - 10.0
-    points = np.concatenate([np.zeros((300, 3)), sphere, rng.integers(-2, 3, (40, 3))])[
-        rng.permutation(340 + len(sphere))
-    ]
-    np.testing.assert_array_equal(KDTreeSearch().neighbors(points, k), ref.nearest(points, points, k))
-    # In float32, and where the distances of the tie are not whole numbers.
+    points = rng.permutation(np.concatenate([np.zeros((300, 3)), sphere, rng.integers(-2, 3, (40, 3))]))
+    # In float32, too, and where the distances of the tie are not whole numbers.
     tilted = (points @ Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix() + [0.1, 0.2, 0.3]).astype(np.float32)
-    coincident = np.concatenate([tilted, np.zeros((300, 3), np.float32)])
-    np.testing.assert_array_equal(KDTreeSearch().neighbors(coincident, k), ref.nearest(coincident, coincident, k))
+    for cloud in (points, np.concatenate([tilted, np.zeros((300, 3), np.float32)])):
+        np.testing.assert_array_equal(KDTreeSearch().neighbors(cloud, k), ref.nearest(cloud, cloud, k))
     queries = np.concatenate([np.zeros((5, 3)), points[np.any(points, axis=1)][:20]])
-    np.testing.assert_array_equal(
-        query(np.eye(4), search_points(queries), search_points(sphere), k).T, ref.nearest(queries, sphere, k)
-    )
+    nearest = query(np.eye(4), search_points(queries), search_points(sphere), k)
+    np.testing.assert_array_equal(nearest.T, ref.nearest(queries, sphere, k))
 
 
 @pytest.mark.parametrize("k", [5, 40])
@@ -227,9 +223,8 @@ def test_traced_and_batched_it_finds_the_same():
         expected = find(*pair, T, 0.3, 0.4)
         size = expected.valid.size
         np.testing.assert_array_equal(traced.valid[:size], expected.valid)
-        np.testing.assert_array_equal(
-            traced.indices[:size][expected.valid], np.asarray(expected.indices)[expected.valid]
-        )
+        indices, rows = (np.asarray(part.indices[:size])[expected.valid] for part in (traced, expected))
+        np.testing.assert_array_equal(indices, rows)
 
 
 @pytest.mark.parametrize("what", ["points", "channels"])

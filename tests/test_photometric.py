@@ -243,9 +243,8 @@ def test_gradients_are_those_of_estimate_pose_at_the_same_matches():
         return weigh(mcg.register(*clouds, PHOTOMETRIC, init=start, search=search, **options).matrix)
 
     def estimated(inputs):
-        return weigh(
-            mcg.estimate_pose(*clouds_with(inputs, source, target), matches, method, init=start, **TO_ROUNDING).matrix
-        )
+        clouds = clouds_with(inputs, source, target)
+        return weigh(mcg.estimate_pose(*clouds, matches, method, init=start, **TO_ROUNDING).matrix)
 
     inputs = {name: value for name, value in inputs_of(source, target, None, None).items() if value is not None}
     expected = check_eager_gradient(estimated, inputs)

@@ -362,10 +362,8 @@ def test_jit_gives_the_pose_of_the_host_before_it_has_converged(room):
 @pytest.mark.parametrize("unit", [1e-2, 1e3])
 def test_the_unit_of_length_does_not_matter(unit, room):
     """A small part is registered as closely, relative to its size, as a room."""
-    expected, result = (
-        mcg.register(*(mcg.preprocess(np.asarray(cloud.points, float) * scale) for cloud in room[:2]), mcg.GICP())
-        for scale in (1, unit)
-    )
+    scaled = ([mcg.preprocess(np.asarray(cloud.points, float) * scale) for cloud in room[:2]] for scale in (1, unit))
+    expected, result = (mcg.register(*clouds, mcg.GICP()) for clouds in scaled)
     assert result.num_iterations == expected.num_iterations and result.status is expected.status
     np.testing.assert_allclose(result.matrix[:3, 3] / unit, expected.matrix[:3, 3], atol=tolerance(1e-5, 1e-10))
     np.testing.assert_allclose(result.matrix[:3, :3], expected.matrix[:3, :3], atol=tolerance(1e-5, 1e-10))

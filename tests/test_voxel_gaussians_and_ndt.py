@@ -66,17 +66,13 @@ def test_flat_cells_are_kept():
 
 def test_cells_of_one_colour():
     points, _ = wall(4000)
-    colours = (points[:, :1] > 1.1).astype(float)
-    whole, split = (
-        mcg.voxel_gaussians(mcg.PointCloud(points, colours), SIZE, channel_size=size) for size in (None, 0.5)
-    )
+    coloured = mcg.PointCloud(points, (points[:, :1] > 1.1).astype(float))
+    # A channel of infinite size does not split.
+    whole, unsplit, split = (mcg.voxel_gaussians(coloured, SIZE, channel_size=size) for size in (None, np.inf, 0.5))
+    np.testing.assert_array_equal(unsplit.points, whole.points)
     assert np.any((whole.channels > 0.05) & (whole.channels < 0.95))
     assert set(np.unique(split.channels)) == {0.0, 1.0}
     assert len(split) > len(whole)
-    # A channel of infinite size does not split.
-    np.testing.assert_array_equal(
-        mcg.voxel_gaussians(mcg.PointCloud(points, colours - 0.5), SIZE, channel_size=np.inf).points, whole.points
-    )
 
 
 def test_missing_channels():
@@ -223,12 +219,10 @@ def test_voxel_sizes_make_the_cells(raw):
 
 
 def test_coarse_sizes_register_voxels_of_a_quarter(raw):
-    voxels, cells = (
-        [make(cloud, size) for cloud in raw[:2]] for make, size in ((mcg.preprocess, 0.2), (mcg.voxel_gaussians, SIZE))
-    )
-    expected = mcg.register(*cells, mcg.D2DNDT(), init=mcg.register(*voxels, mcg.GICP()).matrix)
-    found = mcg.register(*raw[:2], mcg.D2DNDT(), voxel_sizes=(0.8, SIZE))
-    np.testing.assert_array_equal(found.matrix, expected.matrix)
+    coarse = mcg.register(*(mcg.preprocess(cloud, 0.2) for cloud in raw[:2]), mcg.GICP())
+    expected = mcg.register(*cells_of(raw), mcg.D2DNDT(), init=coarse.matrix)
+    result = mcg.register(*raw[:2], mcg.D2DNDT(), voxel_sizes=(0.8, SIZE))
+    np.testing.assert_array_equal(result.matrix, expected.matrix)
 
 
 @pytest.mark.parametrize("method", [mcg.NDT, mcg.D2DNDT], ids=["ndt", "d2d-ndt"])
