@@ -1,7 +1,6 @@
 """Nearest neighbours against brute force: ties, padding, channels, the gate."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -204,27 +203,6 @@ def test_a_cloud_without_valid_rows_has_no_matches(empty):
     pair |= {name: pair[name].replace(valid=np.zeros_like(pair[name].valid)) for name in empty}
     for method in (PointToPoint(), ColorICP(0.1)):
         assert not np.any(find_correspondences(*pair.values(), T, method, max_distance=1.0).valid)
-
-
-def find(source, target, pose, weights, max_distance):
-    return find_correspondences(source, target, pose, ColorICP(weights), max_distance=max_distance)
-
-
-@pytest.mark.slow
-def test_traced_and_batched_it_finds_the_same():
-    # The second lacks channels, which the first does not.
-    pairs = [clouds()[0], partial_clouds()[0], clouds(seed=20)[0]]
-    pose = jnp.asarray(T, pairs[0][0].points.dtype)
-    jitted = jax.jit(find)(*pairs[0], pose, 0.3, 0.4)
-    sources, targets = (PointCloud.stack(side) for side in zip(*pairs, strict=True))
-    lanes = jax.jit(jax.vmap(find, in_axes=(0, 0, None, None, 0)))(sources, targets, pose, 0.3, np.full(3, 0.4))
-    batched = [jax.tree.map(lambda leaf, i=i: leaf[i], lanes) for i in range(3)]
-    for pair, traced in zip([pairs[0], *pairs], [jitted, *batched], strict=True):
-        expected = find(*pair, T, 0.3, 0.4)
-        size = expected.valid.size
-        np.testing.assert_array_equal(traced.valid[:size], expected.valid)
-        indices, rows = (np.asarray(part.indices[:size])[expected.valid] for part in (traced, expected))
-        np.testing.assert_array_equal(indices, rows)
 
 
 @pytest.mark.parametrize("what", ["points", "channels"])
