@@ -197,6 +197,18 @@ def test_correspondences_against_the_reference(weights, max_distance):
     np.testing.assert_allclose(np.asarray(found.distances)[:150][valid], distances, atol=tolerance(1e-6, 1e-12))
 
 
+def test_padding_is_never_matched():
+    """Here, padding of the target lies at the origin, right on top of the source."""
+    points, channels = ref.scene(140, 3)
+    target = preprocess(PointCloud(points + np.array([3.0, 0, 0]), channels), num_neighbors=4).pad(160)
+    target = target.replace(points=np.where(target.valid[:, None], target.points, 0))
+    source = preprocess(PointCloud(0.01 * points[:100], channels[:100]), num_neighbors=4).pad(160)
+    for method in (PointToPoint(), ColorICP(0.1)):
+        found = find_correspondences(source, target, None, method, max_distance=10.0)
+        assert np.asarray(found.indices)[:100].max() < 140
+        np.testing.assert_array_equal(found.valid, np.arange(160) < 100)
+
+
 @pytest.mark.parametrize("empty", [("source",), ("target",), ("source", "target")])
 def test_a_cloud_without_valid_rows_has_no_matches(empty):
     pair = dict(zip(("source", "target"), clouds()[0], strict=True))
