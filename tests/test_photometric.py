@@ -112,7 +112,7 @@ def test_a_wall_of_sharp_edges_is_constrained(seed, method, largest):
 
 
 @pytest.mark.slow
-def test_transformations_find_the_same_pose():
+def test_transformations_and_lanes_find_the_same_pose():
     """Also of channels with a gain and an offset, which are estimated there too."""
     source, target, _ = pair(wall, 900, truth=SMALL)
     source = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
@@ -121,12 +121,13 @@ def test_transformations_find_the_same_pose():
     clouds = source, target.pad(1024)
     program = jax.jit(lambda *clouds: mcg.register(*clouds, PHOTOMETRIC, **options)).lower(*clouds)
     assert solves_single_matrices(program)
-    inside = program.compile()(*clouds)
-    np.testing.assert_allclose(inside.matrix, outside.matrix, atol=2e-6)
-    assert inside.status == outside.status and inside.num_iterations == outside.num_iterations
-    for name, rtol, atol in (("information", 1e-2, 1e-3), ("covariance", 0.05, 0.02)):
-        actual, expected = getattr(inside, name), getattr(outside, name)
-        np.testing.assert_allclose(actual, expected, rtol=rtol, atol=atol * expected.max())
+    (lane,) = mcg.register_batch([source], [target], PHOTOMETRIC, **options)
+    for inside in (program.compile()(*clouds), lane):
+        np.testing.assert_allclose(inside.matrix, outside.matrix, atol=2e-6)
+        assert inside.status == outside.status and inside.num_iterations == outside.num_iterations
+        for name, rtol, atol in (("information", 1e-2, 1e-3), ("covariance", 0.05, 0.02)):
+            actual, expected = getattr(inside, name), getattr(outside, name)
+            np.testing.assert_allclose(actual, expected, rtol=rtol, atol=atol * expected.max())
 
 
 @pytest.mark.slow
@@ -157,6 +158,20 @@ def test_forces_are_the_gradient_of_the_cost():
     change = jax.jit(lambda moved: jax.jvp(lambda moved: of(moved, "force"), (moved,), (axis,))[1])(moved)
     stiffness = jax.jit(lambda moved: of(moved, "stiffness"))(moved)
     np.testing.assert_allclose(np.sum(stiffness[0]), -np.sum(change[0]), rtol=0.15)
+
+
+def test_gains_and_offsets_apply_to_values_and_slopes():
+    source, target, truth, matches = at_truth()
+    _, term = with_fixed_numbers(source, target, PHOTOMETRIC, truth, matches)
+    darker = source.replace(channels=np.float32(0.7) * source.channels - np.float32(0.2))
+    brighter = replace(term, gains=term.gains / 0.7, offsets=term.offsets + 0.2 / 0.7)
+    samples = []
+    for cloud, each in ((source, term), (darker, brighter)):
+        matched, _, motion = matched_at(cloud, target, PHOTOMETRIC, truth, matches)
+        samples.append(sampled(each, matched, motion))
+    for name in ("values", "slopes", "products"):
+        expected, found = (np.asarray(getattr(each, name)) for each in samples)
+        np.testing.assert_allclose(found, expected, atol=1e-3 * np.nanmax(np.abs(expected)), err_msg=name)
 
 
 @pytest.mark.slow
