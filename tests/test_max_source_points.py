@@ -166,29 +166,19 @@ def test_odometry_and_multiway_match_at_most_10000_points():
     assert matched == [10_000, 10_500, 10_000]
 
 
-def written(folder, size):
-    """Paths of a source and a target."""
-    files = [str(folder / name) for name in ("source.npz", "target.npz")]
-    for path, cloud in zip(files, pair(size=size)[:2], strict=True):
+def test_the_command_line_takes_a_number_or_all(tmp_path):
+    """And chooses parameters as `register` does, of the points that are matched."""
+    *files, output = (str(tmp_path / name) for name in ("source.npz", "target.npz", "pose.txt"))
+    for path, cloud in zip(files, pair(size=400)[:2], strict=True):
         io.write(path, cloud)
-    return files
-
-
-def test_the_command_line_takes_a_number_or_all(tmp_path, capsys):
-    files, shown = written(tmp_path, 400), []
-    for number in ("150", "all"):
-        assert main(["register", *files, "--max-source-points", number]) == 0
-        shown.append(capsys.readouterr().out)
-    assert shown[0] != shown[1]
-
-
-@pytest.mark.slow
-def test_the_command_line_chooses_parameters_as_register_does(tmp_path):
-    """Of the points that are matched."""
-    files, output = written(tmp_path, 900), str(tmp_path / "pose.txt")
-    assert main(["register", *files, "--method", "mc-gicp", "--output", output, "--max-source-points", "150"]) == 0
-    expected = mcg.register(*map(io.read, files), mcg.MultiChannelGICP(), max_source_points=150)
-    np.testing.assert_allclose(io.read_poses(output)[0], expected.matrix, atol=1e-9)
+    poses = []
+    for number, shown in ((150, "150"), (None, "all")):
+        arguments = [*files, "--method", "mc-gicp", "--output", output, "--max-source-points", shown]
+        assert main(["register", *arguments]) == 0
+        expected = mcg.register(*map(io.read, files), mcg.MultiChannelGICP(), max_source_points=number)
+        poses.append(io.read_poses(output)[0])
+        np.testing.assert_allclose(poses[-1], expected.matrix, atol=1e-9)
+    assert np.any(poses[0] != poses[1])
 
 
 @pytest.mark.slow
