@@ -1,7 +1,6 @@
-"""What is compiled."""
+"""Counting of compilations."""
 
 import contextlib
-import re
 
 import jax
 
@@ -20,10 +19,3 @@ def compilations():
         yield found
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
-
-
-def solves_single_matrices(program):
-    """Whether a lowered program solves no matrices in batches by LAPACK: on two cores, two such calls at once wait for
-    each other forever (jax 0.10.2)."""
-    operands = re.findall(r"@lapack_\w+\(.*?: \(tensor<([^>]*)>", program.as_text())
-    return operands and {operand.count("x") for operand in operands} == {2}

@@ -1,5 +1,6 @@
 """Registration and alignment inside `jit` and other transformations: as outside; `test_gradients.py` has gradients."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
@@ -8,7 +9,6 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from tests.compilations import solves_single_matrices
 from tests.differences import GATE, case, weigh
 from tests.precision import in_float64
 from tests.scenes import motion, pair
@@ -20,6 +20,18 @@ def test_gradient_by_the_initial_pose_is_0(noisy):
     matches = mcg.find_correspondences(source, target, motion(), method, max_distance=GATE)
     gradient = jax.grad(lambda init: weigh(mcg.estimate_pose(source, target, matches, method, init=init).matrix))
     np.testing.assert_array_equal(gradient(jnp.asarray(motion(), source.points.dtype)), 0)
+
+
+def solves_single_matrices(program):
+    """Whether no matrices are solved in batches by LAPACK: on two cores, two such calls at once wait for each other
+    forever (jax 0.10.2)."""
+    operands = re.findall(r"@lapack_\w+\(.*?: \(tensor<([^>]*)>", program.as_text())
+    return operands and {operand.count("x") for operand in operands} == {2}
+
+
+def test_photometric_program_solves_no_batches_of_matrices_by_lapack():
+    program = jax.jit(lambda *clouds: mcg.register(*clouds, mcg.MultiChannelGICP(photometric=True)))
+    assert solves_single_matrices(program.lower(*pair(size=200)[:2]))
 
 
 @in_float64
