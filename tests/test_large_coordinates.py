@@ -9,7 +9,7 @@ from mcgicp_jax import io
 from mcgicp_jax.__main__ import main
 from mcgicp_jax.metrics import pose_error
 from tests.refusals import refused
-from tests.scenes import motion, room_corner
+from tests.scenes import motion, raw_pair
 
 UTM = np.array([4.5e5, 5.2e6, 300.0])
 TRUTH = motion()
@@ -20,15 +20,9 @@ OPTIONS = ["--max-distance", "0.5", "--voxel-size", "off"]
 
 def scene(offset):
     """Source and target, raw, moved away by an offset that leaves the points' own digits as they are."""
-    clouds = []
-    for seed in (1, 2):
-        points, channels = room_corner(1000, seed=seed, channels=1)
-        points = points if seed == 2 else (points - TRUTH[:3, 3]) @ TRUTH[:3, :3]
-        # What UTM coordinates can hold, and LAS: a tenth of a millimetre.
-        points = np.round(points, 4)
-        channels = np.round(100 * (channels + 2))
-        clouds.append(mcg.PointCloud(points + offset, channels, channel_names=["intensity"]))
-    return clouds
+    # What UTM coordinates can hold, and LAS: a tenth of a millimetre.
+    arrays = [(np.round(c.points, 4), np.round(100 * (c.channels + 2))) for c in raw_pair(size=1000, channels=1)[:2]]
+    return [mcg.PointCloud(points + offset, values, channel_names=["intensity"]) for points, values in arrays]
 
 
 @pytest.fixture(scope="module")

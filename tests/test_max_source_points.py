@@ -14,7 +14,7 @@ from mcgicp_jax._math.statistics import spread_rows
 from tests.compilations import compilations
 from tests.differences import GATE, TO_ROUNDING, assert_alike, check_eager_gradient, clouds_with, inputs_of, weigh
 from tests.precision import in_float64
-from tests.reference import logarithm
+from tests.reference import logarithm, symmetric
 from tests.refusals import refused
 from tests.scenes import covariances, pair
 
@@ -56,7 +56,8 @@ def test_the_pose_is_that_of_the_points_alone_with_neighbours_among_all(clouds):
     """With covariances of the whole cloud, given to a cloud of the same rows."""
     source, target = clouds
     rows = spread_rows(source.valid, 150)
-    given = np.asarray(mcg.preprocess(source.unpad().replace(covariances=_matrices(mcg.GICP(), source))).covariances)
+    whole = source.unpad().replace(covariances=symmetric(covariances(mcg.GICP(), source)))
+    given = np.asarray(mcg.preprocess(whole).covariances)
     few = mcg.preprocess(mcg.PointCloud(source.points[rows], source.channels[rows], covariances=given[rows]))
     options = {"max_distance": GATE, "hold_unconstrained": False, **TO_ROUNDING}
     expected = mcg.register(few, target, mcg.GICP(), **options)
@@ -64,11 +65,6 @@ def test_the_pose_is_that_of_the_points_alone_with_neighbours_among_all(clouds):
     np.testing.assert_allclose(found.matrix, expected.matrix, atol=1e-10)
     assert found.num_inliers == expected.num_inliers <= 150
     np.testing.assert_allclose(found.overlap, found.num_inliers / 150)
-
-
-def _matrices(method, cloud):
-    xx, xy, xz, yy, yz, zz = np.asarray(covariances(method, cloud))
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
 
 
 @pytest.mark.parametrize("count, matched", [(150, 150), (401, 400)])
@@ -137,7 +133,7 @@ def test_gradients_agree_with_differences(clouds, method):
 @pytest.mark.slow
 def test_gradients_with_given_covariances_and_inside_jit(clouds):
     source, target = clouds
-    source = source.replace(covariances=_matrices(mcg.GICP(), source))
+    source = source.replace(covariances=symmetric(covariances(mcg.GICP(), source)))
 
     def loss(points, covariances):
         cloud = source.replace(points=points, covariances=covariances)
