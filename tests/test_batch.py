@@ -274,6 +274,17 @@ def test_workers_have_the_settings_of_the_caller(raw):
     assert result.T_target_source.wxyz_xyz.dtype == np.float64
 
 
+def test_workers_average_raw_clouds_in_the_voxels_of_preprocessed_ones(raw):
+    """The voxel size of a cloud is no leaf of its pytree."""
+    (source, target, _), options = raw[0], {"max_distance": 0.5}
+    sides = [source], [mcg.preprocess(target, 0.4)]
+    sent, expected = (
+        mcg.register_batch(*sides, mcg.GICP(), executor=executor, **options)
+        for executor in (Elsewhere(sends=True), None)
+    )
+    assert_same(sent, expected)
+
+
 def test_workers_leave_the_filters_of_warnings_alone(raw, monkeypatch):
     """Threads share them: a worker that changed them would hide the warnings of others."""
     sources, targets = prepared(raw[:2])

@@ -110,6 +110,8 @@ def test_masked_arrays_keep_their_mask(dtype):
     replaced = PointCloud(points, channels, channel_valid=~partial(1)).replace(channels=values)
     np.testing.assert_array_equal(replaced.channel_valid, measured & ~partial(1))
     np.testing.assert_array_equal(replaced.channels, np.where(measured & ~partial(1), channels, 0))
+    single = PointCloud(points, channels[:, 0], channel_valid=np.ones(150, bool)).replace(channels=values[:, 0])
+    np.testing.assert_array_equal(single.channel_valid, measured[:, :1])
     assert PointCloud(np.ma.masked_array(points), np.ma.masked_array(channels)).channel_valid is None
     np.testing.assert_array_equal(PointCloud(foreign(hidden)).points, cloud.points)
     structured = np.ma.masked_array(np.zeros(5, [(axis, dtype) for axis in "xyz"]))
@@ -165,6 +167,7 @@ def test_replace_exchanges_and_leaves_the_rest():
     assert len(cloud.replace(channels=jnp.zeros((160, 5))).channel_names) == 5
     assert cloud.replace(channels=np.zeros(160)).channels.shape == (160, 1)
     assert cloud.replace(covariances=None).covariances is None
+    assert isinstance(cloud.replace(times=[0.5] * 160).times, np.ndarray)
     whole = np.round(100 * np.asarray(cloud.channels))
     assert_same(cloud.replace(channels=whole.astype(int)), cloud.replace(channels=whole))
 
@@ -228,6 +231,8 @@ def test_stack():
     np.testing.assert_array_equal(origins, [cloud.origin for cloud in far])
     assert np.asarray(origins).dtype == np.float64
     refused(lambda: PointCloud.stack([]), "clouds")
+    for of_single_clouds in (stacked.pad, stacked.unpad, lambda: stacked.transform(T)):
+        refused(of_single_clouds, "points", (2, 256, 3))
 
 
 def test_stack_of_whole_and_partial_channels():

@@ -20,6 +20,7 @@ import jaxlie
 import numpy as np
 import psutil
 
+from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.linear_maps import KnownJacobian, primal, with_derivative
 from mcgicp_jax._compute.messages import warn
@@ -323,9 +324,15 @@ def _as_numpy(sent: Any) -> Any:
     def convert(value: Any) -> Any:
         if isinstance(value, Options):
             return _as_numpy(value)
+        if isinstance(value, PointCloud):
+            # As a pytree it would lose its voxel size, in which a raw cloud of the same pair is averaged.
+            return value.replace_rows(**{name: convert(field) for name, field in vars(value).items()})
         return np.asarray(value) if isinstance(value, jax.Array) else value
 
-    return replace(sent, **jax.tree.map(convert, dict(vars(sent)), is_leaf=is_deferred))
+    def is_leaf(value: Any) -> bool:
+        return is_deferred(value) or isinstance(value, PointCloud)
+
+    return replace(sent, **jax.tree.map(convert, dict(vars(sent)), is_leaf=is_leaf))
 
 
 def _words(error: BaseException) -> str:

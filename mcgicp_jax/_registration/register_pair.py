@@ -327,7 +327,9 @@ def problem_of(
 
 def _warn_of_near_points(run: Run) -> None:
     points, near = np.asarray(run.inputs.source.points)[run.inputs.source.valid], run.problem.settings.near
-    if not (np.square(points).sum(axis=1) < near**2).any():
+    with np.errstate(over="ignore"):
+        squares = np.square(points).sum(axis=1)
+    if not (squares < near**2).any():
         return
     before = cast(Directions, run.loop.state.directions)
     after = cast(HostExecutor, run.executor).directions_by_all_points(run.loop)
