@@ -104,10 +104,8 @@ def las_data(point_format=2, num_points=N, **columns):
     return las
 
 
-@pytest.fixture(scope="module")
-def seeds(tmp_path_factory):
+def small_files(folder):
     """Small valid files of every format and encoding, by name."""
-    folder = tmp_path_factory.mktemp("seeds")
     for suffix in FORMATS:
         io.write(folder / f"ours{suffix}", make(INTENSITY if suffix == ".bin" else INTENSITY + RGB))
     for kind in ("text", "binary"):
@@ -117,6 +115,11 @@ def seeds(tmp_path_factory):
     for point_format in (2, 7):
         las_data(point_format, red=np.arange(N)).write(str(folder / f"{point_format}.laz"))
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def seeds(tmp_path_factory):
+    return small_files(tmp_path_factory.mktemp("seeds"))
 
 
 # Round trips
