@@ -167,7 +167,8 @@ def test_replace_exchanges_and_leaves_the_rest():
     assert len(cloud.replace(channels=jnp.zeros((160, 5))).channel_names) == 5
     assert cloud.replace(channels=np.zeros(160)).channels.shape == (160, 1)
     assert cloud.replace(covariances=None).covariances is None
-    assert isinstance(cloud.replace(times=[0.5] * 160).times, np.ndarray)
+    times = np.linspace(0, 1, 160)
+    assert cloud.replace(times=times).times is times and isinstance(cloud.replace(times=list(times)).times, np.ndarray)
     whole = np.round(100 * np.asarray(cloud.channels))
     assert_same(cloud.replace(channels=whole.astype(int)), cloud.replace(channels=whole))
 
@@ -177,6 +178,7 @@ def test_replace_refuses_what_does_not_fit():
     for name in shapes:
         for shape in shapes[name]:
             refused(lambda name=name, shape=shape: ready().replace(**{name: np.zeros(shape)}), name)
+    refused(lambda: ready().replace(times=np.full(160, np.nan)), "times")
     refused(lambda: ready().replace(colour=np.zeros((160, 3))), "replace")
 
 

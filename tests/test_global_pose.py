@@ -395,7 +395,7 @@ def hall(seed):
 
 
 def test_a_hall_is_not_turned_where_furniture_would_stand_in_free_space():
-    """From the opposite corner furniture looks different, and features find the pose alone that is half a turn off."""
+    """Furniture looks different from the opposite corner, and features find only the pose that is half a turn off."""
     source, target, truth = hall(seed=0)
     result = mcg.global_pose(source, target)
     assert result.ambiguous and found(result.runner_up, truth, mcg.PointCloud(source))

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 import mcgicp_jax as mcg
 from mcgicp_jax import metrics
-from tests.graphs import SMALL, grid, measured, moved
+from tests.graphs import SMALL, grid, joined, measured, moved
 from tests.reference import logarithm
 from tests.scenes import motion
 
@@ -30,7 +30,7 @@ def test_a_start_from_trusted_loops_is_near_the_minimum():
 
 
 @pytest.mark.parametrize(("right", "others", "trusted"), [(4, 3, False), (6, 3, True), (1, 0, True)])
-def test_loops_that_alone_connect_two_parts_are_trusted_if_most_agree(right, others, trusted):
+def test_loops_that_alone_connect_two_parts_are_trusted_if_enough_agree(right, others, trusted):
     """Wrong loops between places that look alike agree with each other, too."""
     rng = np.random.default_rng(0)
     truth, _ = grid(2)
@@ -47,6 +47,21 @@ def test_loops_that_alone_connect_two_parts_are_trusted_if_most_agree(right, oth
     found = mcg.optimize_poses(mcg.PoseGraph(truth, edges))
     assert found.status is (mcg.Status.CONVERGED if trusted else mcg.Status.DEGENERATE)
     assert found.kept[len(chain) :].sum() == right
+    # With precise positions of all poses, the parts need no loops.
+    everywhere = np.diag([1e6, 1e6, 1e6, 0, 0, 0])[None].repeat(len(truth), axis=0)
+    priors = mcg.Edge(np.full(len(truth), mcg.WORLD), np.arange(len(truth)), truth, everywhere)
+    assert mcg.optimize_poses(mcg.PoseGraph(truth, joined(edges, priors))).converged
+
+
+def test_parts_that_other_loops_join_need_no_agreement_of_theirs():
+    truth, _ = grid(2)
+    chain, loops = [(0, 1), (2, 3), (4, 5), (6, 7)], [(k, k + 2) for k in range(6)] * 3 + [(0, 6)]
+    i, j = np.array(chain + loops).T
+    motions = np.linalg.inv(truth[i]) @ truth[j]
+    motions[-1, :3, 3] += 1
+    edges = mcg.Edge(i, j, motions, np.tile(1e6 * np.eye(6), (len(i), 1, 1)), uncertain=np.arange(len(i)) >= len(chain))
+    found = mcg.optimize_poses(mcg.PoseGraph(truth, joined(edges, edges[len(edges) - 1 :], edges[4:5])))
+    assert found.converged and (~found.kept).sum() == 2
 
 
 def test_rejected_loops_leave_no_trace():

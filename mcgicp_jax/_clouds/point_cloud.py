@@ -77,6 +77,13 @@ def _advice(shape: tuple[int, ...]) -> str:
     return "; pass PointCloud(points, channels)" if len(shape) == 2 and shape[1] > 3 else ""
 
 
+def _checked_times(times: Values) -> Any:
+    values = _as_float("times", times)
+    if is_concrete(values) and not np.isfinite(values).all():
+        raise ValueError("times: expected finite numbers, got NaN or infinity")
+    return values
+
+
 def _checked_mask(channels: Any, channel_valid: Values | None, shape: tuple[int, ...]) -> Any:
     """`channel_valid` in this shape, False also where `channels` is a masked array; None if nothing is missing."""
     valid: Any = None
@@ -233,11 +240,9 @@ class PointCloud(eqx.Module):
         self.channel_names = _checked_names(channel_names, self.channels.shape[1])
         self.times = None
         if times is not None:
-            values = _as_float("times", times)
+            values = _checked_times(times)
             if values.shape != (size,):
                 raise ValueError(f"times: expected shape ({size},) to go with points, got {values.shape}")
-            if is_concrete(values) and not np.isfinite(values).all():
-                raise ValueError("times: expected finite numbers, got NaN or infinity")
             # Scaled so that the earliest is 0 and the latest 1; if all are equal, all are 1.
             xp = np if isinstance(values, np.ndarray) else jnp
             first, last = xp.min(values, initial=np.inf), xp.max(values, initial=-np.inf)
@@ -291,8 +296,8 @@ class PointCloud(eqx.Module):
         """Return a copy with the given fields replaced (`points`, `channels`, `covariances`, ...).
 
         `channels` may be (N,) for a single one; an existing `channel_valid` applies to them, too. `points` are relative
-        to `origin`; `neighbors` stay as they were, constants to autodiff: after moves comparable to the spacing,
-        preprocess again.
+        to `origin`, `times` from 0 to 1. `neighbors` stay as they were, constants to autodiff: after moves comparable
+        to the spacing, preprocess again.
 
         Raises:
             ValueError: if a field does not exist, or a shape or dtype does not fit the cloud.
@@ -307,7 +312,9 @@ class PointCloud(eqx.Module):
         shapes = {name: np.shape(fields[name]) for name in ("points", "valid", "origin")}
         shapes |= {"covariances": (*shapes["points"], 3), "times": shapes["valid"]}
         channels: Any = arrays.get("channels")
-        for name in arrays.keys() & {"points", "channels", "covariances", "times"}:
+        if arrays.get("times") is not None:
+            arrays["times"] = _checked_times(arrays["times"])
+        for name in arrays.keys() & {"points", "channels", "covariances"}:
             if arrays[name] is not None:
                 array, dtype = _as_float(name, arrays[name]), self.points.dtype
                 # JAX warns of conversions to float64 where it has none.

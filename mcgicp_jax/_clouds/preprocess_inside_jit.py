@@ -66,7 +66,8 @@ def _valid_first(cloud: PointCloud) -> PointCloud:
         if array is not None:
             # A cloud without any valid row has zeros, whose derivative is 0.
             mask = valid[rows].reshape(-1, *[1] * (array.ndim - 1))
-            arrays[name] = jnp.where(mask, jnp.asarray(array)[rows], jnp.zeros((), array.dtype))
+            values = jnp.asarray(array)[rows]
+            arrays[name] = jnp.where(mask, values, jnp.zeros((), values.dtype))
     return cloud.replace_rows(valid=place < jnp.sum(valid), **arrays)
 
 

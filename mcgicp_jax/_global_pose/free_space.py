@@ -5,17 +5,18 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from mcgicp_jax._math.statistics import spread_rows
 
-# Numbers of points of the scan that sees and of the one that is seen.
+# Sizes of the samples of the scan that sees, and of the one that is seen: 20 ms for both directions.
 _RAYS, _POINTS = 20_000, 4000
-# A point is in free space if this many rays around it end farther away, by this fraction of its range and a voxel. With
-# eight rays, many of them on one scan line, edges at the right pose count as well, and objects at turned ones do not.
+# A point is in free space if each of the `_AROUND` nearest rays ends beyond (1 + `_FARTHER`) times its range, and a
+# voxel. With eight rays, most of which are of one scan line, points at edges count at the right pose, and objects at
+# turned ones do not. With 0.05 to 0.1 the fractions of KITTI and of simulated halls hardly differ.
 _AROUND, _FARTHER = 24, 0.1
-# Quantile of the angles to that many neighbours in the scan itself, up to which a direction is seen.
+# A direction is seen if its `_AROUND` rays are not farther away than this quantile of the same distance in the scan.
 _SEEN = 0.9
 
 
@@ -24,8 +25,8 @@ class View:
 
     Args:
         points: (N, 3) metres.
-        origin: (3,) position of the sensor, metres. Elsewhere, as in maps, points in free space are frequent at right
-            poses and at wrong ones.
+        origin: (3,) position of the sensor, metres. If the sensor was not there, as in maps, right poses have points in
+            free space, too.
     """
 
     def __init__(self, points: Float[np.ndarray, "N 3"], origin: Float[np.ndarray, "3"]):
@@ -33,7 +34,7 @@ class View:
 
     @cached_property
     def _rays(self) -> tuple[KDTree, Float[np.ndarray, "n"], float]:
-        """Directions and lengths of rays, and the largest distance of directions that are seen."""
+        """Directions and lengths of rays, and the largest distance to the rays of a direction that is seen."""
         directions, ranges = self._polar(_sample(self.points, _RAYS))
         tree = KDTree(directions)
         around = tree.query(_sample(directions, _POINTS), k=[min(_AROUND, len(ranges))])[0]
@@ -44,8 +45,8 @@ class View:
         ranges = np.linalg.norm(offsets, axis=1)
         return offsets / np.maximum(ranges, np.finfo(np.float32).tiny)[:, None], ranges
 
-    def sees_through(self, other: View, matrix: Float[np.ndarray, "4 4"], margin: float) -> float:
-        """Fraction of the other scan's points in free space, of those in directions that this one sees.
+    def sees_through(self, other: View, matrix: Float[np.ndarray, "4 4"], margin: float) -> Int[np.ndarray, "2"]:
+        """Numbers of a sample of the other scan's points that are in free space, and in directions that this one sees.
 
         `matrix` is the pose of the other scan in this one's frame; `margin`, metres, is the least distance behind.
         """
@@ -54,7 +55,7 @@ class View:
         distances, rays = tree.query(directions, k=np.arange(1, 1 + min(_AROUND, len(lengths))))
         inside = distances[:, -1] <= seen
         free = lengths[rays].min(axis=1) > (1 + _FARTHER) * ranges + margin
-        return float(np.sum(free & inside) / max(inside.sum(), 1))
+        return np.array([np.sum(free & inside), np.sum(inside)])
 
 
 def _sample(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "n 3"]:

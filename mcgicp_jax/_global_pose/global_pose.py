@@ -57,16 +57,17 @@ _SPARSE, _SPARSE_POWER = np.array([3000, 1400]), 1.5
 # a turn reach 0.86 to 1.2. Where furniture is nearly the same after half a turn, the right pose had 0.4 of the inliers
 # and 0.45 of the overlap of the wrong one, but 1.7 times its (a/m)² and the same support.
 _RIVAL_INLIERS, _RIVAL_OVERLAP, _RIVAL_AGREEMENT, _RIVAL_SUPPORT = 0.5, 0.9, 0.8, 0.9
-# Smallest fractions of the best pose's overlap and (a/m)², and largest fraction of its points in free space, with which
-# another pose is a rival, too. Scans of simulated halls, whose walls are the same after half a turn but for corners and
-# furniture, have 0.5 to 16 % of their points in free space at the turned pose, 0 to 0.1 % at the right one, which
-# reaches 0.55 of the overlap and 0.14 of (a/m)², with hardly an inlier. At right poses, moving cars are up to 1 % of
-# KITTI's points and the roof of the recording car 9 % of `lidar_pair`'s, at turned poses as well.
-_LESS_OVERLAP, _LESS_AGREEMENT, _LESS_IN_FREE_SPACE = 0.5, 0.1, 0.15
-# Fraction of points in free space from which on half turns of the best pose are verified: 20 points.
-_IN_FREE_SPACE = 0.0025
-# Number of normals that the axes of half turns are computed from.
-_NORMALS = 2000
+# A pose is also a rival if it has at least these fractions of the best pose's overlap and (a/m)², and at most this
+# fraction of its points in free space. Scans of simulated halls, whose walls are the same after half a turn, have 0.5
+# to 16 % of their points in free space at the turned pose, 0 to 0.1 % at the right one, which has 0.55 of the overlap
+# and 0.14 of (a/m)², with hardly an inlier. At right poses, moving cars are up to 1 % of KITTI's points and the roof of
+# the recording car 9 % of `lidar_pair`'s, at turned poses as well.
+_FREER_OVERLAP, _FREER_AGREEMENT, _FREER_POINTS = 0.5, 0.1, 0.15
+# Fraction of points in free space from which on half turns of the best pose are verified, 20 of 8,000 points; and least
+# number of points in directions that are seen, by which it is estimated.
+_IN_FREE_SPACE, _LEAST_SEEN = 0.0025, 1000
+# Number of normals that the axes of half turns are computed from, as many as `surface_agreement` compares.
+_NORMALS = 2048
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +79,8 @@ class Candidate:
         num_inliers: number of matches whose points are at most 1.5 voxels apart at this pose.
         overlap: fraction of the source's voxels with a voxel of the target within 1.5 voxels.
         agreement, support: (a/m)² and the support, see `GlobalPoseResult.support`.
-        in_free_space: fraction of the points that lie where the other scan saw through, from its origin; computed if
-            it matters.
+        in_free_space: fraction of both scans' points that lie where the other scan saw through, see `View`; computed if
+            it matters. NaN if the scans hardly see each other's directions.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -95,20 +96,24 @@ class Candidate:
         parts of a room coincide after half a turn than at the right pose."""
         return self.num_inliers * self.agreement
 
+    @property
+    def is_supported(self) -> bool:
+        return self.num_inliers >= MIN_INLIERS and self.support >= 1
+
     def rivals(self, best: Candidate) -> bool:
-        """Whether this pose is about as good as the best one."""
+        """Whether this pose makes the best one ambiguous."""
         as_many = self.num_inliers >= _RIVAL_INLIERS * best.num_inliers
         as_much = as_many and self.overlap >= _RIVAL_OVERLAP * best.overlap
         as_good = self.agreement >= _RIVAL_AGREEMENT * best.agreement and (
             as_much or self.support >= _RIVAL_SUPPORT * best.support
         )
-        more_likely = (
+        is_freer = (
             best.in_free_space >= _IN_FREE_SPACE
-            and self.in_free_space <= _LESS_IN_FREE_SPACE * best.in_free_space
-            and self.overlap >= _LESS_OVERLAP * best.overlap
-            and self.agreement >= _LESS_AGREEMENT * best.agreement
+            and self.in_free_space <= _FREER_POINTS * best.in_free_space
+            and self.overlap >= _FREER_OVERLAP * best.overlap
+            and self.agreement >= _FREER_AGREEMENT * best.agreement
         )
-        return as_good or more_likely
+        return as_good or is_freer
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,9 +125,8 @@ class GlobalPoseResult:
             found.
         success: whether to trust the pose: it has at least ten inliers and a `support` of 1, which clouds of different
             scenes did not reach in `tests/benchmarks`, and the result is not `ambiguous`.
-        ambiguous: whether another pose is about as good as the best one, as in symmetric or repetitive scenes, or far
-            fewer points lie where the other scan saw through, seen from the origins of the clouds. False if the best
-            pose has too little support.
+        ambiguous: whether another pose is about as good as the best one, as in symmetric or repetitive scenes, or has
+            far fewer points in space that the other scan saw through. False if the best pose has too little support.
         num_inliers, overlap: number of inliers of the best pose, and the overlapping fraction of the source.
         num_matches: number of matches, inliers and outliers.
         support: i/√n (a/m)² of the best pose, for i inliers of the n matches within the overlap; a, the fraction of
@@ -132,8 +136,8 @@ class GlobalPoseResult:
             little but walls, and (1400 / N)^1.5 times that for N < 1400; and at least 0.7 where the shape of the clouds
             leaves a direction of motion unconstrained, as on a plane or in a corridor, so that surfaces coincide at
             wrong poses, too.
-        runner_up: the second-best pose that differs from the best one by more than five voxels; one that is about as
-            good, if there is any. None if no other pose was verified: all had less than half the inliers.
+        runner_up: the second-best pose that differs from the best one by more than five voxels; one that makes it
+            ambiguous, if there is any. None if no other pose was verified.
         voxel_size: metres; edge of the voxels for which features are computed.
     """
 
@@ -169,11 +173,14 @@ def global_pose(
     means and standard deviations of the channels around it; (2) match voxels that are mutual nearest neighbours in
     these features, of which most may be wrong; (3) compute poses from triplets of matches that agree with each other;
     (4) refine them by graduated non-convexity (Yang et al. 2020); (5) verify the best by a coarse registration, which
-    uses the channels. On one machine, the same clouds give the same result, to the last bit. Runs on the host, with
+    uses the channels, and half turns of the best as well, if it leaves points in space that the other scan saw through.
+    On one machine, the same clouds give the same result, to the last bit. Runs on the host, with
     programs whose shapes do not depend on the clouds.
 
     Args:
         source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
+            Which space a scan saw through is judged from (0, 0, 0) of its coordinates: for this, pass scans in the
+            frames of their sensors.
         voxel_size: metres. By default the smallest size at which the smaller cloud has at most 6,000 voxels, the larger
             one at most 20,000, and each at most half as many voxels as points.
         correspondences: integer arrays (n,) of source rows and (n,) of target rows that replace steps 1 and 2, such as
@@ -309,22 +316,24 @@ class _Scene(NamedTuple):
         return Candidate(matrix, inliers, overlap, agreement, float(support / least))
 
     def in_free_space(self, matrix: Float[np.ndarray, "4 4"]) -> float:
-        """See `Candidate`; mean of both scans."""
+        """See `Candidate`."""
         source, target, size = self.source_view, self.target_view, self.voxel_size
-        return 0.5 * (target.sees_through(source, matrix, size) + source.sees_through(target, inverse(matrix), size))
+        free, seen = target.sees_through(source, matrix, size) + source.sees_through(target, inverse(matrix), size)
+        return float(free / seen) if seen >= _LEAST_SEEN else np.nan
 
     def half_turns(self, matrix: Float[np.ndarray, "4 4"]) -> Iterator[Float[np.ndarray, "4 4"]]:
         """The pose after half a turn about each principal axis of the normals, through the middle of both clouds.
 
-        What walls and ground have in common after half a turn, they have about these axes.
+        Walls and ground coincide after half a turn about these axes, unless other surfaces outweigh them.
         """
         points = np.asarray(self.target.points, np.float64)
         rows = np.arange(0, len(points), 1 + len(points) // _NORMALS)
         normals = spreads(points, self.target.deferred_neighbors, rows)[2]
         moved = np.asarray(self.source.points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        for axis in (axes := np.linalg.eigh(normals.T @ normals)[1]).T:
-            both = np.concatenate([points, moved]) @ axes
-            center = axes @ (0.5 * (both.min(axis=0) + both.max(axis=0)))
+        axes = np.linalg.eigh(normals.T @ normals)[1]
+        both = np.concatenate([points, moved]) @ axes
+        center = axes @ (0.5 * (both.min(axis=0) + both.max(axis=0)))
+        for axis in axes.T:
             turn = np.eye(4)
             turn[:3, :3] = 2 * np.outer(axis, axis) - np.eye(3)
             turn[:3, 3] = center - turn[:3, :3] @ center
@@ -340,12 +349,11 @@ def _best_pose(scene: _Scene, source_center: np.ndarray, target_center: np.ndarr
         pose.matrix[:3, 3] += target_center - pose.matrix[:3, :3] @ source_center
     best, *others = sorted(verified, key=lambda pose: -pose.evidence)
     runner_up = max(others, key=lambda pose: (pose.rivals(best), pose.evidence), default=None)
-    enough = best.num_inliers >= MIN_INLIERS and best.support >= 1
     rivalled = runner_up is not None and runner_up.rivals(best)
     return GlobalPoseResult(
         matrix=best.matrix,
-        success=bool(enough and not rivalled),
-        ambiguous=bool(enough and rivalled),
+        success=bool(best.is_supported and not rivalled),
+        ambiguous=bool(best.is_supported and rivalled),
         num_inliers=best.num_inliers,
         num_matches=num_matches,
         overlap=best.overlap,
@@ -388,7 +396,9 @@ def _verified(scene: _Scene) -> list[Candidate]:
         start[:3, :3], start[:3, 3] = poses.rotation[i], poses.translation[i]
         verify(start)
     best = max(verified, key=lambda pose: pose.evidence, default=None)
-    if best is None or scene.in_free_space(best.matrix) < _IN_FREE_SPACE:
+    if best is None or not best.is_supported or any(pose.rivals(best) for pose in verified if pose is not best):
+        return verified
+    if not scene.in_free_space(best.matrix) >= _IN_FREE_SPACE:
         return verified
     for start in scene.half_turns(best.matrix):
         verify(start)

@@ -196,7 +196,7 @@ class _Start:
                 text = "register_batch: %d processes start, and take over from threads once they run"
                 LOGGER.info(text, self._num_workers)
                 self.processes = Processes(self._num_workers)
-                # Any function will do: that job and pair can be sent, and unpickled by a worker, is all that is asked.
+                # `len` only tests whether a worker can unpickle the job and the pair.
                 self._first = self.processes.submit(len, (_as_numpy(self._job), _as_numpy(pair)))
             if self._first is None or not self._first.done():
                 return False
@@ -326,7 +326,7 @@ def _as_numpy(sent: Any) -> Any:
             return _as_numpy(value)
         if isinstance(value, PointCloud):
             # As a pytree it would lose its voxel size, in which a raw cloud of the same pair is averaged.
-            return value.replace_rows(**{name: convert(field) for name, field in vars(value).items()})
+            return jax.tree.map(convert, value, is_leaf=is_deferred).replace_rows(voxels=value.voxels)
         return np.asarray(value) if isinstance(value, jax.Array) else value
 
     def is_leaf(value: Any) -> bool:

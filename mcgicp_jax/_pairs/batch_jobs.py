@@ -231,7 +231,7 @@ class BatchJob:
         ready = self.prepare(pair)
         if isinstance(ready, PairResult):
             return ready
-        # Of a prepared pair of which nothing is traced, the initial pose may be that of `global_pose`.
+        # A pair of `run_differentiated` may start at a pose of `global_pose`, with its doubt and coarse distance.
         distance = min(ready.max_coarse_distance, pair.max_coarse_distance)
         return self._register_prepared(replace(ready, doubt=ready.doubt or pair.doubt, max_coarse_distance=distance))
 

@@ -175,7 +175,7 @@ def doubt_of_start_pose(start: GlobalPoseResult) -> str:
     if start.success:
         return ""
     if start.ambiguous:
-        return "global pose: another pose fits the clouds as well, so that it is UNVERIFIED"
+        return "global pose: another pose is about as likely, so that it is UNVERIFIED"
     count = f"{start.num_inliers} of {start.num_matches} matches of features"
     if not start.num_inliers:
         return f"global pose: none found, {count} support one; pass a pose as init"

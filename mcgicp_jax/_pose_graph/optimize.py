@@ -87,8 +87,8 @@ class PoseGraphResult:
         CONVERGED; MAX_ITERATIONS; NON_FINITE: poses or residuals overflow; DEGENERATE: the measurements do not connect
         all poses with each other or with the world, or leave a direction of motion of at least one pose unconstrained.
         Along such directions, relative motions stay near those of the initial poses. Also DEGENERATE: uncertain edges
-        alone join two parts of the graph, and more than a third of them were rejected; wrong loops agree with each
-        other where places look alike.
+        alone join two parts of the graph, and more than 40 % of them were rejected; wrong loops agree with each other
+        where places look alike.
         """
         return Status(int(np.asarray(self.status_code))) if is_concrete(self.status_code) else self.status_code
 

@@ -33,7 +33,7 @@ _SELECTIONS = 5
 # Least fraction of the uncertain edges between two parts of a graph that must be kept, if nothing else joins the parts.
 # After lost frames, wrong loops agree with each other where places look alike. Of simulated rounds through a town
 # without 3 or 6 of 64 frames, 0.1 to 0.54 were kept at wrong poses, 0.67 to 1 at right ones.
-_AGREEING = 0.66
+_AGREEING = 0.6
 # Rejected measurements are tested again if their squared residual is below this multiple of the threshold: beyond, the
 # other measurements would have to be half as certain as the rejected one.
 _NEAR = 4.0
@@ -257,22 +257,30 @@ def _wrongly_rejected(state: lm.GraphState, thresholds: lm.PerMeasurement) -> lm
 
 
 def _is_disputed(state: lm.GraphState, anchors: Edge, uncertain: lm.Mask) -> bool:
-    """Whether uncertain edges, of which too many are rejected, join two parts that certain measurements do not."""
+    """Whether uncertain edges, of which too many are rejected, join two parts of a graph that nothing else joins."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    rows, number = state.equations.rows, len(anchors)
-    certain = np.concatenate([np.asarray(factor.information).any(axis=(1, 2)) for factor in state.equations.factors])
-    certain &= ~uncertain
-    # Edges that measure all directions alone.
-    certain[:number] &= ~anchors.information.any(axis=(1, 2))
-    joining, shape = rows[certain].T, (len(state.poses), len(state.poses))
-    parts = connected_components(coo_array((np.ones(joining.shape[1]), tuple(joining)), shape), directed=False)[1]
-    ends = np.sort(parts[rows[:number]], axis=1)
+    factors, rows, size, number = state.equations.factors, state.equations.rows, len(state.poses), len(anchors)
+
+    def components(pairs: Int[np.ndarray, "_ 2"]) -> Int[np.ndarray, "n"]:
+        graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), (size, size))
+        return connected_components(graph, directed=False)[1]
+
+    # Certain measurements of all six directions.
+    joining = np.concatenate([np.linalg.matrix_rank(factor.information, hermitian=True) >= 6 for factor in factors])
+    joining &= ~uncertain
+    joining[:number] &= ~anchors.information.any(axis=(1, 2))
+    ends = np.sort(components(rows[joining])[rows[:number]], axis=1)
     between = uncertain[:number] & (ends[:, 0] != ends[:, 1])
-    pairs, numbers = np.unique(ends[between], axis=0, return_inverse=True)
+    keys, numbers = np.unique(ends[between] @ [size, 1], return_inverse=True)
+    pairs = np.stack(np.divmod(keys, size), axis=1)
     kept, total = np.bincount(numbers, state.weights[:number][between], len(pairs)), np.bincount(numbers)
-    return bool(np.any((kept > 0) & (kept < _AGREEING * total)))
+    joined = components(pairs[kept >= _AGREEING * total])
+    if not np.any((kept > 0) & (joined[pairs[:, 0]] != joined[pairs[:, 1]])):
+        return False
+    # Certain measurements of some directions, such as positions of all poses, may suffice together.
+    return _is_degenerate(lm.GraphState.at(factors, 1.0 * ~uncertain, state.poses), anchors)
 
 
 def _is_degenerate(state: lm.GraphState, anchors: Edge) -> bool:
