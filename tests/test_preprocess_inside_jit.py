@@ -74,7 +74,8 @@ def test_means_of_voxels():
     measured = np.random.default_rng(1).random(channels.shape) < 0.7
     inside = averaged_inside(points, channels, measured)
     assert inside.channel_valid.dtype == bool and inside.points.dtype == inside.channels.dtype == np.float32
-    order, numbers, count = map(np.asarray, jax.jit(_voxels_of)(points, np.ones(len(points), bool), VOXEL))
+    voxels_of = jax.jit(partial(_voxels_of, voxel_size=VOXEL))
+    order, numbers, count = map(np.asarray, voxels_of(points, np.ones(len(points), bool)))
     assert np.sum(inside.valid) == count == numbers.max() + 1
     for number in range(count):
         rows = order[numbers == number]

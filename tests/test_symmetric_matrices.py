@@ -152,4 +152,4 @@ def test_rotate_multiply_and_outer(seed):
     np.testing.assert_allclose(moved.T, np.einsum("nij,nj->ni", matrices, vectors), atol=atol)
     np.testing.assert_allclose(ref.symmetric(products), vectors[:, :, None] * vectors[:, None, :], atol=2 * atol)
     np.testing.assert_allclose(cov.matrix_from_symmetric(packed), matrices, atol=0)
-    np.testing.assert_allclose(cov.symmetric_from_matrix(matrices), packed, atol=0)
+    np.testing.assert_allclose(cov.symmetric_from_matrix(jnp.asarray(matrices, dtype())), packed, atol=0)
