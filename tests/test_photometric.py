@@ -262,8 +262,9 @@ def test_gradients_are_those_of_estimate_pose_at_the_same_matches():
     inputs = {name: value for name, value in inputs_of(source, target, None, None).items() if value is not None}
     expected = check_eager_gradient(estimated, inputs)
     assert all(np.abs(gradient).max() > 0 for gradient in expected.values())
-    assert_alike(jax.grad(registered)(inputs), expected, 1e-6)
-    assert_alike(jax.jit(jax.grad(partial(registered, search=mcg.DenseSearch())))(inputs), expected, 1e-6)
+    outside = jax.grad(registered)(inputs)
+    assert_alike(outside, expected, 1e-6)
+    assert_alike(jax.jit(jax.grad(partial(registered, search=mcg.DenseSearch())))(inputs), outside, 1e-9)
 
 
 @pytest.mark.slow

@@ -173,13 +173,13 @@ def global_pose(
     means and standard deviations of the channels around it; (2) match voxels that are mutual nearest neighbours in
     these features, of which most may be wrong; (3) compute poses from triplets of matches that agree with each other;
     (4) refine them by graduated non-convexity (Yang et al. 2020); (5) verify the best by a coarse registration, which
-    uses the channels, and half turns of the best as well, if it leaves points in space that the other scan saw through.
-    On one machine, the same clouds give the same result, to the last bit. Runs on the host, with
-    programs whose shapes do not depend on the clouds.
+    uses the channels. If points of one scan lie where the other saw through, half turns of the best pose are verified,
+    too. On one machine, the same clouds give the same result, to the last bit. Runs on the host, with programs whose
+    shapes do not depend on the clouds.
 
     Args:
         source, target: raw or preprocessed clouds, or (N, 3) arrays in metres; they may lie anywhere, in any rotation.
-            Which space a scan saw through is judged from (0, 0, 0) of its coordinates: for this, pass scans in the
+            What space a scan saw through is judged from (0, 0, 0) of its coordinates: for this, pass scans in the
             frames of their sensors.
         voxel_size: metres. By default the smallest size at which the smaller cloud has at most 6,000 voxels, the larger
             one at most 20,000, and each at most half as many voxels as points.
@@ -398,8 +398,11 @@ def _verified(scene: _Scene) -> list[Candidate]:
     best = max(verified, key=lambda pose: pose.evidence, default=None)
     if best is None or not best.is_supported or any(pose.rivals(best) for pose in verified if pose is not best):
         return verified
-    if not scene.in_free_space(best.matrix) >= _IN_FREE_SPACE:
+    fraction = scene.in_free_space(best.matrix)
+    if not fraction >= _IN_FREE_SPACE:
         return verified
     for start in scene.half_turns(best.matrix):
         verify(start)
-    return [replace(pose, in_free_space=scene.in_free_space(pose.matrix)) for pose in verified]
+    others = [pose for pose in verified if pose is not best]
+    fractions = [scene.in_free_space(pose.matrix) for pose in others]
+    return [replace(p, in_free_space=f) for p, f in zip([best, *others], [fraction, *fractions], strict=True)]

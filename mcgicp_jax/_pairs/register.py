@@ -196,8 +196,8 @@ def doubt_of(result: RegistrationResult) -> str | None:
 def start_from_anywhere(
     init: str, source: PointCloud | Values, target: PointCloud | Values, options: Options
 ) -> tuple[GlobalPoseResult, float]:
-    """The initial pose of a registration with `init="global"`, none if it has no inliers, and the largest coarse
-    `max_distance` from it, metres."""
+    """The result of `global_pose`, without inliers if it found no pose, and the largest coarse `max_distance` from its
+    pose, metres; `init` must be "global"."""
     if init != "global":
         raise ValueError(f'init: expected a pose, "global" or None, got {init!r}')
     if not is_concrete(source, target):

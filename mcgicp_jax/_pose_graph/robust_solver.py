@@ -261,6 +261,8 @@ def _is_disputed(state: lm.GraphState, anchors: Edge, uncertain: lm.Mask) -> boo
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
+    if state.weights.all():
+        return False
     factors, rows, size, number = state.equations.factors, state.equations.rows, len(state.poses), len(anchors)
 
     def components(pairs: Int[np.ndarray, "_ 2"]) -> Int[np.ndarray, "n"]:
