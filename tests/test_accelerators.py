@@ -8,6 +8,7 @@ import subprocess
 import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
+from mcgicp_jax._registration import chunks
 from mcgicp_jax.metrics import pose_error
 from tests.batches import METHOD, assert_same, raw_pair
 from tests.scenes import pair
@@ -102,6 +104,23 @@ class ForFewPairs(mcg.DenseSearch):
             return indices, batched[0]
 
         return same(super().nearest_traced(pose, source, target, *rest))
+
+
+@pytest.mark.parametrize(
+    ("memory", "size"),
+    [
+        (None, 256),
+        ({"bytes_limit": 80e9, "bytes_in_use": 1e9}, 256),
+        ({"bytes_limit": 80e9, "bytes_in_use": 79e9}, 64),
+        ({"bytes_limit": 1e8}, 16),
+    ],
+)
+def test_chunks_are_as_large_as_memory_allows(memory, size):
+    device = SimpleNamespace(platform="gpu", memory_stats=lambda: memory)
+    group = chunks._Group(None, SimpleNamespace(devices=[device]), 64)
+    cloud = SimpleNamespace(valid=np.ones(2048))
+    group.waiting.append((0, (None, None, cloud, cloud)))
+    assert group._largest() == size
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +92,18 @@ def test_processes_take_over_where_they_pay(raw, tmp_path, pays, caplog, monkeyp
     assert_same(results, 500 * batch([source], target, executor="threads"))
     assert os.getpid() in pids_in(tmp_path) and len(pids_in(tmp_path)) == 1 + num_cores()
     assert f"{num_cores()} processes start" in caplog.text
+    with caplog.at_level(logging.INFO, "mcgicp_jax"):
+        batch([source] * 4, [target] * 4)
+    assert "4 pairs by threads" in caplog.text
+
+
+def test_processes_do_not_start_beyond_the_memory_of_a_container(raw, tmp_path, pays, monkeypatch):
+    (source,), (target,) = prepared(raw[:1])
+    limit = tmp_path / "memory.max"
+    limit.write_text(f"{psutil.Process().memory_info().rss + 2**29}\n")
+    monkeypatch.setattr(batch_executors, "_MEMORY_LIMITS", [limit, tmp_path / "none"])
+    batch(in_turn(tmp_path, source, 40), target)
+    assert pids_in(tmp_path) == {os.getpid()}
 
 
 @pytest.mark.parametrize("sendable", [0, 1000])
@@ -222,6 +235,25 @@ def test_gradients_are_those_of_threads(raw, offset):
     np.testing.assert_allclose(slope, np.linalg.norm(by_workers), rtol=1e-4)
 
 
+def test_gradients_by_default_where_processes_pay(raw, pays, monkeypatch):
+    """Threads run the first pairs, which are differentiated here, and processes the others, with their Jacobians."""
+    (source,), (target,) = prepared(raw[:1])
+    by_workers = mock.Mock(wraps=batch_executors.KnownJacobian)
+    monkeypatch.setattr(batch_executors, "KnownJacobian", by_workers)
+
+    def loss(points, executor, count):
+        clouds = [source.replace_rows(points=points)] * count
+        results = mcg.register_batch(clouds, target, METHOD, max_distance=0.5, executor=executor)
+        return sum(jnp.sum(result.matrix[:3, 3]) for result in results) / count
+
+    # Workers that wait take over at once.
+    told(os.getpid)
+    gradient = jax.grad(loss)(source.points, None, 30 * num_cores())
+    assert 0 < by_workers.call_count < 30 * num_cores()
+    expected = jax.grad(loss)(source.points, "threads", 2)
+    np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
 def test_warnings_of_workers_are_shown_here():
     cloud = np.random.default_rng(0).random((300, 3))
     cloud[0] = np.nan
@@ -279,17 +311,23 @@ def cloud():
 
 count = int(sys.argv[1])
 print(os.getpid(), flush=True)
-results = mcg.register_batch([cloud] * count, cloud, mcg.PointToPoint(), max_iterations=1, executor="processes")
+executor = {"by default": None}.get(sys.argv[2], sys.argv[2])
+# By default, they start as soon as the time of a pair is known.
+mcg._pairs.batch_executors._PAYS = 0.0
+results = mcg.register_batch([cloud] * count, cloud, mcg.PointToPoint(), max_iterations=1, executor=executor)
 print("done", len(results), flush=True)
 """
 
 
 @contextlib.contextmanager
-def started(folder, count):
+def started(folder, count, executor="processes"):
     """A process group of its own that runs the script."""
     script = folder / "script.py"
     script.write_text(SCRIPT)
-    command, pipes = [sys.executable, str(script), str(count)], {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command, pipes = (
+        [sys.executable, str(script), str(count), executor],
+        {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE},
+    )
     with subprocess.Popen(command, text=True, start_new_session=True, **pipes) as process:
         yield process
 
@@ -324,6 +362,16 @@ def test_a_script_without_a_guard_leaves_no_process(tmp_path, number):
             assert ("done 6" in text) == (number is None)
             assert errors.count("Traceback") == (number is not None), errors
     assert all_ended(pids)
+
+
+def test_a_script_that_is_interrupted_after_processes_took_over_leaves_none(tmp_path):
+    with started(tmp_path, 100_000, "by default") as process:
+        pids = iter(lambda: int(process.stdout.readline()), None)
+        worker = next(pid for pid in pids if pid != process.pid)
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert errors.count("KeyboardInterrupt") == errors.count("Traceback") == 1, errors
+    assert all_ended({worker})
 
 
 CELL = """

@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, ParamSpec, TypeVar
 
 import jax
+import loky
 
 from mcgicp_jax._compute.messages import calling_line, shown_at
 
@@ -69,10 +70,14 @@ def with_settings_of_package(function: Callable[Parameters, Answer]) -> Callable
 
 
 def num_cores() -> int:
-    """Number of cores that this process may use, at most as many as XLA may."""
+    """Number of cores that this process may use, at most as many as XLA or the quota of a container allows."""
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get("PJRT_NPROC", "")
-    return min(count, int(limit)) if limit.isdecimal() and int(limit) else count
+    return min(count, _quota(), int(limit) if limit.isdecimal() and int(limit) else count)
+
+
+# Files of the quota are read once.
+_quota = functools.cache(loky.cpu_count)
 
 
 def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None = None) -> list[Answer]:

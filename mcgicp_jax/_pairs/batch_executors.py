@@ -4,9 +4,11 @@ workers may die."""
 from __future__ import annotations
 
 import collections
+import contextlib
 import itertools
+import pathlib
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent import futures
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
@@ -26,10 +28,11 @@ from mcgicp_jax._compute.linear_maps import KnownJacobian, primal, with_derivati
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.programs import COMPILATIONS, LOGGER
 from mcgicp_jax._compute.threads import num_cores, with_settings
-from mcgicp_jax._pairs.batch_jobs import NUM_CHECKED, BatchJob, Pair, PairResult, PreparedPair
+from mcgicp_jax._pairs.batch_jobs import NUM_CHECKED, BatchJob, Pair, PairResult, PreparedPair, RanPair
 from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax._registration.assessment import fields_of_pose
 from mcgicp_jax._registration.options import Options
+from mcgicp_jax._registration.register_pair import Run, results_of
 from mcgicp_jax._registration.result import RegistrationResult, Status
 
 GivenExecutor: TypeAlias = Executor | Literal["processes", "threads"] | None
@@ -45,6 +48,8 @@ _PAYS = 1.5
 # Seconds in which two workers start on two cores, besides what they compile; and memory of a worker, bytes, with pairs
 # of some 10,000 points.
 _START, _MEMORY = 3.2, 2**29
+# Limits of the memory of a container, in two versions of Linux's control groups.
+_MEMORY_LIMITS = [pathlib.Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory/memory.limit_in_bytes")]
 
 
 def executor_of(executor: GivenExecutor) -> ChosenExecutor:
@@ -79,36 +84,53 @@ def run(
             )
         return pair
 
-    for result in _results(job, map(concrete, pairs), executor, count):
+    results: Iterator[PairResult]
+    concrete_pairs = map(concrete, pairs)
+    if executor is None and job.uses_chunks:
+        results = map(PairResult.with_warning, job.register_in_chunks(concrete_pairs, num_cores()))
+    else:
+        results = _by_executor(job, concrete_pairs, executor, count, job.register_chunk)
+    for result in results:
         yield result.index, result.registration
 
 
-def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor) -> list[RegistrationResult]:
-    """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives."""
+def run_differentiated(
+    job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None
+) -> list[RegistrationResult]:
+    """The results of pairs whose arrays differentiation traces; workers compute the poses and their derivatives. Those
+    of pairs that threads have run are computed side by side, once all have."""
     results: dict[int, RegistrationResult] = {}
     prepared: dict[int, PreparedPair] = {}
+    runs: dict[int, Run] = {}
+    if executor is None and job.has_priors:
+        # Derivatives by priors.
+        executor = "threads"
 
     def sent() -> Iterator[Pair]:
         """The values of pairs, each prepared while workers have those before it."""
         for pair in pairs:
-            if not is_concrete(pair.prior):
+            if executor != "threads" and not is_concrete(pair.prior):
                 raise ValueError(f"priors[{pair.index}]: expected concrete arrays with an executor, got tracers")
-            ready = job.prepare(pair, pair.index < NUM_CHECKED)
+            ready = job.prepare(pair, executor in (None, "threads") or pair.index < NUM_CHECKED)
             if isinstance(ready, PairResult):
                 results[pair.index] = ready.with_warning().registration
                 continue
             # With a prior, whose pose is in the user's frames, the equation of the centred pose depends on the origins.
-            if ready.prior is not None and not is_concrete(*(cloud.origin for cloud in ready.inputs[:2])):
+            origins = [cloud.origin for cloud in ready.inputs[:2]]
+            if executor != "threads" and ready.prior is not None and not is_concrete(*origins):
                 raise ValueError(
                     f"priors[{pair.index}]: expected clouds with concrete origins with an executor, got tracers"
                 )
             prepared[pair.index] = ready
             source, target, *_ = ready.inputs.values()
-            start = ready.init, ready.prior, ready.traced, ready.doubt, ready.max_coarse_distance
+            start = ready.init, primal(ready.prior), ready.traced, ready.doubt, ready.max_coarse_distance
             yield Pair(pair.index, source, target, *start)
 
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
-    for answer in _results(fixed, sent(), executor, None):
+    for answer in _by_executor(fixed, sent(), executor, count, fixed.run_chunk):
+        if isinstance(answer, RanPair):
+            runs[answer.index] = answer.run
+            continue
         ready, result = prepared[answer.index], answer.registration
         if answer.jacobian:
             values, inputs = [np.asarray(result.centred.wxyz_xyz)], [ready.leaves[i] for i in ready.traced]
@@ -118,26 +140,34 @@ def run_differentiated(job: BatchJob, pairs: Iterator[Pair], executor: Executor)
                 origins = result.source_origin, result.target_origin
             result = result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
         results[answer.index] = result
+    differentiated = results_of(list(runs.values()), [prepared[index].inputs for index in runs])
+    for (index, run), result in zip(runs.items(), differentiated, strict=True):
+        ready = prepared[index]
+        answer = PairResult(index, ready.checked(result), ready.doubt or run.doubt)
+        results[index] = answer.with_warning().registration
     return [results[index] for index in sorted(results)]
 
 
-def _results(job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None) -> Iterator[PairResult]:
-    if executor is None and job.uses_chunks:
-        yield from map(PairResult.with_warning, job.register_in_chunks(pairs, num_cores()))
-    elif executor is None:
-        yield from _by_threads_then_processes(job, pairs, count)
+def _by_executor(
+    job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None, in_thread: Callable[..., Any]
+) -> Iterator[Any]:
+    """The results of pairs; threads of this process get those of a chunk by `in_thread`."""
+    if executor is None:
+        yield from _by_threads_then_processes(job, pairs, count, in_thread)
     elif executor == "threads":
-        yield from _by_threads(job, pairs)
+        yield from _by_threads(job, pairs, in_thread)
     else:
         yield from ChunkedExecutor(job, executor).run(pairs)
 
 
-def _by_threads(job: BatchJob, pairs: Iterator[Pair]) -> Iterator[PairResult]:
+def _by_threads(job: BatchJob, pairs: Iterator[Pair], in_thread: Callable[..., Any]) -> Iterator[Any]:
     with ThreadPoolExecutor(num_cores(), thread_name_prefix="mcgicp") as threads:
-        yield from ChunkedExecutor(job, threads, max_submitted=2 * num_cores()).run(pairs)
+        yield from ChunkedExecutor(job, threads, max_submitted=2 * num_cores(), work=in_thread).run(pairs)
 
 
-def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int | None) -> Iterator[PairResult]:
+def _by_threads_then_processes(
+    job: BatchJob, pairs: Iterator[Pair], count: int | None, in_thread: Callable[..., Any]
+) -> Iterator[Any]:
     """Threads register the first pairs, and are timed. If processes pay, they start meanwhile and register the rest."""
     rest: Iterator[Pair] | None = None
     start = _Start(job, count)
@@ -156,7 +186,7 @@ def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int 
             yield pair
 
     try:
-        for result in _by_threads(job, until_processes_run()):
+        for result in _by_threads(job, until_processes_run(), in_thread):
             start.finished += 1
             begin = time.perf_counter()
             yield result
@@ -166,6 +196,8 @@ def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int 
             start.processes.shutdown(cancel_futures=True)
     if rest is not None and start.processes is not None:
         yield from ChunkedExecutor(job, start.processes, at_home=True).run(rest)
+    elif start.possible and start.processes is None:
+        LOGGER.info("register_batch: %d pairs by threads; to start processes would not pay", start.finished)
 
 
 class _Start:
@@ -183,13 +215,13 @@ class _Start:
         self._first: Future[int] | None = None
         # Seconds that it takes to send a pair, once it is known.
         self._sending: float | None = None
-        self._num_workers = min(num_cores(), psutil.virtual_memory().available // _MEMORY)
+        self._num_workers = min(num_cores(), _available_memory() // _MEMORY)
         # Workers of other pools have their cores to themselves.
-        self._possible = self._num_workers > 1 and current_process().name == "MainProcess"
+        self.possible = self._num_workers > 1 and current_process().name == "MainProcess"
 
     def has_ended(self, pair: Pair) -> bool:
         """Whether the processes run; starts them if they pay and can be sent the next pair."""
-        if not self._possible:
+        if not self.possible:
             return False
         try:
             if self._first is None and self._pays(pair):
@@ -204,11 +236,11 @@ class _Start:
         # Not what can be pickled, or imported by a worker; or this platform starts none.
         except Exception as error:
             LOGGER.info("register_batch: pairs stay in threads; %s", _words(error))
-            self._possible = False
+            self.possible = False
             if self.processes is not None:
                 self.processes.shutdown(cancel_futures=True)
                 self.processes = None
-        return self._possible
+        return self.possible
 
     def _pays(self, pair: Pair) -> bool:
         now = time.perf_counter() - self.idle
@@ -230,15 +262,33 @@ class _Start:
         return self._sending is not None and left * (saved - self._sending) > _PAYS * start
 
 
+def _available_memory() -> int:
+    """Bytes that further processes may use; in a container, those of its limit that this one does not."""
+    available = psutil.virtual_memory().available
+    for path in _MEMORY_LIMITS:
+        # There is no such file, or no limit.
+        with contextlib.suppress(OSError, ValueError):
+            available = min(available, int(path.read_text()) - psutil.Process().memory_info().rss)
+    return available
+
+
 class ChunkedExecutor:
     """Chunks of pairs submitted to an executor, and pairs to retry.
 
     A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
     failed chunks are suspects, submitted again at the end one by one: only those that fail alone get `WORKER_FAILED`.
     `at_home`: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
+    `work`: what workers do with a chunk, if not `register_chunk`.
     """
 
-    def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False, max_submitted: int = _MAX_SUBMITTED):
+    def __init__(
+        self,
+        job: BatchJob,
+        executor: Executor,
+        at_home: bool = False,
+        max_submitted: int = _MAX_SUBMITTED,
+        work: Callable[..., Any] | None = None,
+    ):
         self._executor, self._at_home = executor, job if at_home else None
         self._replacement: Executor | None = None
         self._pickled = not isinstance(executor, ThreadPoolExecutor)
@@ -247,7 +297,7 @@ class ChunkedExecutor:
             # More submitted chunks than loky's queue holds, so that no worker waits.
             self._chunk_size, self._max_submitted = _SMALL_CHUNK, 4 * executor.num_workers
         job = _as_numpy(job) if self._pickled else job
-        work = job.register_chunk_alone if isinstance(executor, Processes) else job.register_chunk
+        work = work or (job.register_chunk_alone if isinstance(executor, Processes) else job.register_chunk)
         self._register = with_settings(work, pickled=self._pickled)
         self._suspects: collections.deque[Pair] = collections.deque()
         self._submitted: dict[Future[list[PairResult]], list[Pair]] = {}
@@ -315,7 +365,7 @@ class ChunkedExecutor:
                     if not self._suspects:
                         warn(f"a worker failed ({reason}); its pairs are submitted again, one by one, at the end")
                     self._suspects.extend(chunk)
-            yield from map(PairResult.with_warning, results)
+            yield from (result.with_warning() if isinstance(result, PairResult) else result for result in results)
 
 
 def _as_numpy(sent: Any) -> Any:

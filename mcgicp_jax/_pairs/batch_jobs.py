@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal, TypeAlias, cast
 
 import jax
@@ -24,7 +23,7 @@ from mcgicp_jax._compute.concrete import is_concrete, is_deferred
 from mcgicp_jax._compute.devices import computed_on_cpu, on_accelerator
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
-from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings
+from mcgicp_jax._compute.threads import with_settings
 from mcgicp_jax._local_geometry.sensor_patterns import doubt_of_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
@@ -119,6 +118,14 @@ class PairResult:
             warning.index, warning.reason = self.index, reason
             warn(warning)
         return self
+
+
+@dataclass(frozen=True)
+class RanPair:
+    """A pair registered in this process, whose result has yet to be computed, with its derivative."""
+
+    index: int
+    run: Run
 
 
 @dataclass(frozen=True)
@@ -237,33 +244,28 @@ class BatchJob:
 
     @_of_a_pair
     def _register_with_jacobian(self, pair: Pair) -> PairResult:
-        values: Any = (pair.source, pair.target, self.method, self.options.robust)
-        inputs = Inputs(*values)._replace(prior=checked_measurements(None, pair.prior, *values[:2])[1])
-        ready = PreparedPair(pair.index, inputs, cast(Pose, pair.init), None, pair.doubt, pair.max_coarse_distance)
+        ready = self._sent(pair)
         run = self._run(ready)
         if isinstance(run, PairResult):
             return run
         (result,) = map(ready.checked, results_of([run], [run.inputs]))
-        leaves = jax.tree.leaves(values, is_leaf=is_deferred)
-        arrays = [leaves[i] for i in pair.traced]
-        slopes = parameters_by(inputs, run.inputs, cast(HostExecutor, run.executor), run.loop, arrays)
+        arrays = [ready.leaves[i] for i in pair.traced]
+        slopes = parameters_by(ready.inputs, run.inputs, cast(HostExecutor, run.executor), run.loop, arrays)
         blocks = tuple(slope.astype(array.dtype) for slope, array in zip(slopes, arrays, strict=True))
         return replace(self._result(pair.index, result, ready.doubt or run.doubt), jacobian=blocks)
 
-    def register_differentiated(self, pairs: Iterable[Pair]) -> list[RegistrationResult]:
-        """The results of pairs whose arrays differentiation traces. All derivatives are computed side by side."""
-        outcomes = {pair.index: self.prepare(pair) for pair in pairs}
-        ready = [pair for pair in outcomes.values() if isinstance(pair, PreparedPair)]
-        # What is traced is traced in this thread alone.
-        calls = [partial(self._run, replace(pair, inputs=pair.inputs.values())) for pair in ready]
-        runs = in_new_thread(partial(side_by_side, calls, num_cores())) if calls else []
-        outcomes |= {pair.index: run for pair, run in zip(ready, runs, strict=True)}
-        ended = [pair for pair in ready if isinstance(outcomes[pair.index], Run)]
-        results = results_of([outcomes[pair.index] for pair in ended], [pair.inputs for pair in ended])
-        for pair, result in zip(ended, results, strict=True):
-            doubt = pair.doubt or outcomes[pair.index].doubt
-            outcomes[pair.index] = PairResult(pair.index, pair.checked(result), doubt)
-        return [outcome.with_warning().registration for outcome in outcomes.values()]
+    @computed_on_cpu
+    def run_chunk(self, chunk: list[Pair]) -> list[RanPair | PairResult]:
+        """`register_chunk` in a thread, for pairs that are differentiated: in this process, their derivatives take less
+        time without a Jacobian."""
+        runs = ((pair.index, self._run(self._sent(pair))) for pair in chunk)
+        return [RanPair(index, run) if isinstance(run, Run) else run for index, run in runs]
+
+    def _sent(self, pair: Pair) -> PreparedPair:
+        """A pair of `run_differentiated`, of values."""
+        values: Any = (pair.source, pair.target, self.method, self.options.robust)
+        inputs = Inputs(*values)._replace(prior=checked_measurements(None, pair.prior, *values[:2])[1])
+        return PreparedPair(pair.index, inputs, cast(Pose, pair.init), None, pair.doubt, pair.max_coarse_distance)
 
     @_of_a_pair
     def _run(self, pair: PreparedPair) -> PairResult | Run:

@@ -1,7 +1,7 @@
 """Many registrations as chunks of one program without callbacks, for accelerators.
 
-The host reads clouds, averages them in voxels and leaves out points, whose number decides shapes; it copies the rows of
-a chunk of pairs into one array. All else is done on the devices: neighbours, surfaces, the loop, its assessment.
+The host reads clouds, averages them in voxels and leaves out points, whose number decides shapes; it stacks the arrays
+of a chunk of pairs. All else is done on the devices: neighbours, surfaces, the loop, its assessment.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ Key = TypeVar("Key")
 # Numbers of pairs of a chunk per device: with a sketch on an H200, chunks of 256 pairs took 0.7 (2,000 points) to 0.95
 # (6,000 points) of the time of chunks of 64. Batches of fewer pairs have smaller chunks. Each size compiles.
 _SIZES = (16, 64, 256)
-# Most rows of both clouds of all pairs of a chunk per device: 256 pairs of two clouds of 4,096 rows. Half as many rows
-# take 0.7 GB of temporary memory (compiled for an H100).
-_ROWS = 2**21
+# Most rows of both clouds of all pairs of a chunk per device: 256 pairs of two clouds of 4,096 rows. And the temporary
+# memory of a row, bytes (MC-GICP with covariances, compiled for an H100), of which a chunk may use half of the memory
+# of the device, or of what is left of it.
+_ROWS, _MEMORY_PER_ROW = 2**21, 1000
 # On a CPU, where pairs that have ended cost as much as others until all have.
 _SIZE_ON_CPU = 4
 # Updates of the pose after which pairs that have not ended leave their chunk and begin again in a chunk of such pairs:
@@ -170,7 +171,10 @@ class _Group(Generic[Key]):
         if self._mesh.devices[0].platform == "cpu":
             return _SIZE_ON_CPU
         rows = sum(cloud.valid.size for cloud in self.waiting[0][1][2:])
-        return max(size for size in _SIZES if size * rows <= _ROWS or size == _SIZES[0])
+        memory = self._mesh.devices[0].memory_stats() or {}
+        free = memory.get("bytes_limit", np.inf) - memory.get("bytes_in_use", 0)
+        most = min(_ROWS, 0.5 * free / _MEMORY_PER_ROW)
+        return max(size for size in _SIZES if size * rows <= most or size == _SIZES[0])
 
     def is_full(self) -> bool:
         return len(self.waiting) >= (self._per_device or self._largest()) * self._mesh.size
