@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import mcgicp_jax as mcg
-from mcgicp_jax import PointCloud
+from mcgicp_jax import PointCloud, Status
 from mcgicp_jax._clouds.preprocess_inside_jit import _voxels_of
+from mcgicp_jax._clouds.voxels import VARIATION
 from tests.precision import in_float64
 from tests.refusals import refused
-from tests.scenes import pair
+from tests.scenes import motion, room_corner
 
 SIZE = 700
 # Metres.
@@ -94,6 +95,20 @@ def test_means_of_voxels():
     assert not np.any(averaged_inside(points, channels, measured, 100).valid)
 
 
+@in_float64
+def test_means_are_those_of_the_host_in_the_same_grid(monkeypatch):
+    points, channels = (array.astype(float) for array in surface())
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    seed = [len(points), *np.sum(points > middle, axis=0)]
+    turn = np.random.default_rng(seed).uniform(-VARIATION, VARIATION, 3)
+    monkeypatch.setattr(jax.random, "uniform", lambda *_: turn)
+    inside = jax.jit(partial(averaged, size=SIZE + 1))(points, channels)
+    expected = mcg.preprocess(PointCloud(points, channels), VOXEL)
+    assert np.sum(inside.valid) == len(expected)
+    np.testing.assert_allclose(inside.points[: len(expected)], expected.points, atol=1e-12)
+    np.testing.assert_allclose(inside.channels[: len(expected)], expected.channels, atol=1e-12)
+
+
 def test_order_and_padding_of_the_points_do_not_matter():
     points, channels = surface()
     rows = np.random.default_rng(2).permutation(len(points))
@@ -119,23 +134,58 @@ def test_derivatives_of_means():
 
 
 @pytest.mark.slow
-def test_from_raw_points_to_a_loss_under_vmap():
-    source, target, truth = pair()
-    sides = np.asarray(source.unpad().points), np.asarray(target.unpad().points)
+@in_float64
+def test_a_pose_has_a_derivative_by_raw_points_and_tells_what_does_not_fit():
+    sides = [np.asarray(room_corner(700, noise=0.01, seed=seed)[0], float) for seed in (1, 2)]
+    # From here on the loop converges without a cycle, to a root.
+    sides[1] = sides[1] @ motion((0.02, -0.01, 0.015, 0.01, 0.02, -0.01))[:3, :3].T + 0.02
+    rng = np.random.default_rng(0)
+    weights, step = rng.normal(size=7), 1e-5 * np.array([[0], [1], [-1]])[..., None]
+    directions = [direction / np.linalg.norm(direction) for direction in rng.normal(size=(2, 700, 3))]
+    tolerances = {"translation_tolerance": 1e-11, "rotation_tolerance": 1e-11}
 
-    def loss(source, target, offset):
-        ready = [mcg.preprocess(points, 0.05, size=2048) for points in (source + offset, target)]
-        result = mcg.register(*ready, mcg.GICP(), max_distance=0.5)
-        error = jnp.linalg.inv(truth) @ result.T_target_source.as_matrix()
-        return jnp.sum(error[:3, 3] ** 2), result.status_code
+    def loss(*sides):
+        ready = [mcg.preprocess(points, 0.15, size=500) for points in sides]
+        result = mcg.register(*ready, mcg.GICP(), max_distance=0.5, **tolerances)
+        return result.T_target_source.wxyz_xyz @ weights, result.status_code
 
-    offsets = np.array([[0.0, 0, 0], [0.02, -0.01, 0.01]], np.float32)
-    (values, statuses), slopes = jax.jit(jax.vmap(jax.value_and_grad(loss, has_aux=True), (None, None, 0)))(
-        *sides, offsets
+    sources, targets = (points + step * direction for points, direction in zip(sides, directions, strict=True))
+    # The last source occupies more than 500 voxels.
+    sources, targets = (
+        np.append(sources, rng.uniform(-3, 3, (1, 700, 3)), axis=0),
+        np.append(targets, targets[:1], axis=0),
     )
-    assert (statuses == mcg.Status.CONVERGED).all() and np.isfinite(slopes).all()
-    # The pose takes the offset back.
-    assert values[0] < 1e-4 and np.sqrt(values[1]) == pytest.approx(np.linalg.norm(offsets[1]), rel=0.1)
+    program = jax.jit(jax.vmap(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)))
+    (values, statuses), slopes = program(sources, targets)
+    assert [Status(int(status)).name for status in statuses] == 3 * ["CONVERGED"] + ["TOO_FEW_CORRESPONDENCES"]
+    expected = (values[1] - values[2]) / 2e-5
+    derivative = sum(np.sum(slope[0] * direction) for slope, direction in zip(slopes, directions, strict=True))
+    np.testing.assert_allclose(derivative, expected, rtol=1e-6)
+    assert all(np.isfinite(slope).all() for slope in slopes)
+
+
+@pytest.mark.parametrize("method", [mcg.GICP(), mcg.MultiChannelGICP()], ids=["gicp", "mc-gicp"])
+def test_clouds_of_one_program_may_be_constants_of_another(method):
+    """JAX's arrays, on which any operation would be traced."""
+    source, target = (averaged_inside(*surface(seed=seed)) for seed in (0, 1))
+    options = {"max_distance": 0.5, "max_iterations": 2}
+
+    def pose(source, target):
+        return mcg.register(source, target, method, **options).matrix
+
+    def cost(source, target):
+        matches = mcg.find_correspondences(source, target, None, method, max_distance=0.5)
+        return mcg.mahalanobis_cost(np.eye(4), source, target, matches, method)
+
+    def moved(points):
+        return source.replace_rows(points=points)
+
+    # Of both clouds: computed while the program is traced.
+    for function in (pose, cost):
+        constant = jax.jit(lambda offset, function=function: function(source, target) + offset)(0.0)
+        np.testing.assert_allclose(constant, function(source, target), rtol=1e-6, atol=1e-6)
+        jax.eval_shape(lambda points, function=function: function(moved(points), target), source.points)
+        jax.eval_shape(lambda points, function=function: function(target, moved(points)), source.points)
 
 
 def test_what_is_missing_is_said():

@@ -17,18 +17,24 @@ from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion, turn_by_quaternion
 
 
+def are_zero(*origins: Array | np.ndarray) -> bool:
+    """Whether origins are zero, which a tracer may not be."""
+    # Operations on JAX's arrays are traced inside `jit`, those of a cloud that another `jit` returned among them.
+    return is_concrete(origins) and not any(np.asarray(origin).any() for origin in origins)
+
+
 @with_settings_of_package
 def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name: str = "init") -> Array | np.ndarray:
     """T(−o_t) · T · T(o_s), (4, 4): the pose between centred coordinates, in its own precision; `name`: for errors."""
     distance = 0.0
-    if is_concrete(source.origin, source.points) and np.any(source.origin):
+    if is_concrete(source.origin, source.points) and not are_zero(source.origin):
         radius = float(np.abs(np.asarray(source.points)).max(initial=0))
         distance = float(np.linalg.norm(source.origin)) / radius if radius > 0 else 0.0
     if isinstance(pose, jaxlie.SE3) and not is_concrete(pose):
         # Outside of `jit` this compiles nothing.
         pose = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
     matrix = pose_matrix(pose, name, distance)
-    if is_concrete(source.origin, target.origin) and not (np.any(source.origin) or np.any(target.origin)):
+    if are_zero(source.origin, target.origin):
         return matrix
     # In this form two far origins cancel exactly before either is rotated.
     shifted = (matrix[:3, :3] - np.eye(3)) @ source.origin + (source.origin - target.origin) + matrix[:3, 3]

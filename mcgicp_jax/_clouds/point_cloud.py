@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, UInt8
 
 from mcgicp_jax._clouds.columns import COLORS, arrays_of
 from mcgicp_jax._clouds.depth_images import back_project
-from mcgicp_jax._compute.concrete import DeferredRows, is_concrete
+from mcgicp_jax._compute.concrete import DeferredRows, is_concrete, with_numpy_constants
 from mcgicp_jax._compute.messages import check_concrete, messages_named
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import with_settings_of_package
@@ -557,10 +557,14 @@ PointCloud.__setattr__ = _set_or_advise  # type: ignore[assignment,method-assign
 
 
 def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
-    if isinstance(cloud, PointCloud):
+    if not isinstance(cloud, PointCloud):
+        with messages_named(name):
+            cloud = PointCloud(cloud)
+    if isinstance(cloud.points, np.ndarray):
         return cloud
-    with messages_named(name):
-        return PointCloud(cloud)
+    constant = with_numpy_constants(cloud)
+    # Pytrees do not have the voxels of a cloud.
+    return cloud if constant is cloud else constant.replace_rows(voxels=cloud.voxels)
 
 
 def check_several(name: str, clouds: object) -> None:

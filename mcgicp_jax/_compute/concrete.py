@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from itertools import chain
@@ -98,6 +99,20 @@ def is_concrete(*trees: object) -> bool:
 
 # Traced inside a trace. The call of a program takes a quarter of the time of an operation.
 _zero = jax.jit(lambda: jnp.zeros(()))
+
+
+def with_numpy_constants(tree: Any) -> Any:
+    """The tree with its concrete JAX arrays in NumPy inside a trace, where the result of any operation on them would be
+    a tracer."""
+    leaves, structure = jax.tree.flatten(tree, is_leaf=has_rows)
+    constants = {i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array) and not is_tracer(leaf)}
+    if not constants or not is_tracer(_zero()):
+        return tree
+    return jax.tree.unflatten(
+        structure, [np.asarray(leaf) if i in constants else leaf for i, leaf in enumerate(leaves)]
+    )
+
+
 # The state of JAX's transformations inside the context below; None outside of it.
 _outside: ContextVar[Any] = ContextVar("outside", default=None)
 
@@ -121,6 +136,18 @@ def outside_trace() -> Iterator[None]:
 def canonical_float() -> Any:
     """JAX's default precision: float64 where x64 is on."""
     return jax.dtypes.canonicalize_dtype(np.float64)
+
+
+def constants_computed(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator of functions whose concrete arguments are constants: computed at once, even while a caller's `jit` is
+    traced."""
+
+    @functools.wraps(function)
+    def computed(*arguments: Any, **named: Any) -> Any:
+        with outside_trace() if is_concrete(arguments, named) else contextlib.nullcontext():
+            return function(*arguments, **named)
+
+    return computed
 
 
 def numpy_for(*trees: object) -> ModuleType:

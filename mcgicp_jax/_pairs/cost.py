@@ -9,8 +9,15 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose
-from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for
+from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
+from mcgicp_jax._compute.concrete import (
+    AnyArray,
+    constant,
+    constants_computed,
+    is_concrete,
+    numpy_for,
+    with_numpy_constants,
+)
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.threads import with_settings_of_package
@@ -29,6 +36,7 @@ from mcgicp_jax._terms.base import AbstractAdaptiveTerm
 
 
 @with_settings_of_package
+@constants_computed
 def mahalanobis_cost(
     pose: Pose,
     source: PointCloud,
@@ -73,6 +81,8 @@ def mahalanobis_cost(
             missing or not positive, a cloud lacks the neighbours that the method needs, or `log_determinant` is set for
             another method.
     """
+    source, target = as_cloud("source", source), as_cloud("target", target)
+    matches = with_numpy_constants(matches)
     check_matches(matches, source, target, method, temperature)
     photometric = isinstance(method, MultiChannelGICP) and method.photometric
     if log_determinant and (photometric or not isinstance(method, AbstractGeneralized)):

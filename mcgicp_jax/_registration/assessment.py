@@ -13,7 +13,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from mcgicp_jax._clouds.origins import pose_in_user_frame
+from mcgicp_jax._clouds.origins import are_zero, pose_in_user_frame
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.cache import Held, Lazy
 from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_for
@@ -163,7 +163,7 @@ def registration_of(
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
     pose, source_origin, target_origin = state.pose, source.origin, target.origin
     fixed_pose, origin = primal((pose, source_origin))
-    at_origin, concrete = is_concrete(origin) and not np.any(origin), is_concrete(state.status)
+    at_origin, concrete = are_zero(origin), is_concrete(state.status)
     numbers: Any = state.status, state.num_iterations, state.record, records._asdict(), matchable
     if concrete:
         # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
@@ -192,8 +192,9 @@ def registration_of(
 
 def fields_of_pose(pose: jaxlie.SE3, source_origin: Any, target_origin: Any) -> dict[str, Any]:
     """Those of a `RegistrationResult` that follow from the pose and the origins of both clouds."""
-    far = not is_concrete(source_origin, target_origin) or np.any(source_origin) or np.any(target_origin)
-    user = se3_from_matrix(pose_in_user_frame(pose, source_origin, target_origin), pose.wxyz_xyz.dtype) if far else pose
+    user = pose
+    if not are_zero(source_origin, target_origin):
+        user = se3_from_matrix(pose_in_user_frame(pose, source_origin, target_origin), pose.wxyz_xyz.dtype)
     return {"T_target_source": user, "source_origin": source_origin, "target_origin": target_origin, "centred": pose}
 
 
@@ -241,7 +242,7 @@ def _uncertainty_in_user_frame(assessment: Assessment, pose: jaxlie.SE3, center:
         variances = xp.diagonal(to_center @ covariance @ to_center.T)
         # On noise-free points a variance is 0, up to rounding.
         deviations = xp.sqrt(xp.maximum(variances, 0)).astype(covariance.dtype)
-        if is_concrete(origin) and not np.any(origin):
+        if are_zero(origin):
             return Uncertainty(covariance, deviations)
         from_centred = translation_adjoint(origin)
         return Uncertainty(from_centred @ covariance @ from_centred.T, deviations)

@@ -11,9 +11,9 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.origins import centred_pose
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
 from mcgicp_jax._compute.cache import cached_with_cloud
-from mcgicp_jax._compute.concrete import constant, is_concrete, numpy_for
+from mcgicp_jax._compute.concrete import constant, constants_computed, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import check_integer, check_positive
 from mcgicp_jax._compute.threads import with_settings_of_package
@@ -27,6 +27,7 @@ from mcgicp_jax._search.default_search import default_search
 
 
 @with_settings_of_package
+@constants_computed
 def find_correspondences(
     source: PointCloud,
     target: PointCloud,
@@ -57,6 +58,7 @@ def find_correspondences(
             channels or dtypes do not fit.
     """
     # Matches are constants to autodiff.
+    source, target = as_cloud("source", source), as_cloud("target", target)
     source, target, pose, method, max_distance = map(primal, (source, target, pose, method, max_distance))
     traced = not is_concrete(source, target, pose, method, max_distance)
     search = search or default_search(traced)

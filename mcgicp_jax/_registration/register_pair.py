@@ -121,9 +121,14 @@ def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> Regist
         state = differentiable(loop, problem, search)
         assessment = assess(loop, jax.lax.stop_gradient(problem), search)
         return registration_of(state, assessment, loop.history, *given[:2], problem.source.search.valid, inputs=given)
-    # Inside `grad` or `jvp`: the values are registered, and `results_of` adds the derivative. In a thread, since calls
-    # of programs take longer inside transformations.
-    ended = run(given, *arguments) if is_concrete(given) else in_new_thread(partial(run, values, *arguments))
+    if is_concrete(given):
+        # Inside `jit`, the constants of a program.
+        with outside_trace():
+            ended = run(given, *arguments)
+    else:
+        # Inside `grad` or `jvp`: the values are registered, and `results_of` adds the derivative. In a thread, since
+        # calls of programs take longer inside transformations.
+        ended = in_new_thread(partial(run, values, *arguments))
     if ended.doubt:
         warn(ended.doubt)
     (result,) = results_of([ended], [given])
