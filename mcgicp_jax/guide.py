@@ -78,7 +78,7 @@ points and prior act in it only along directions that they know far more precise
 starts at its pose, and weighs matches, tie points and prior by their covariances (Hansen 1982, generalised method of
 moments). It is the result, and its `covariance` and `information` include tie points and prior. They also constrain
 directions that the clouds do not (`UnconstrainedDirection.constrained_by_ties`). Where they contradict the matches, the
-pose is an average, and UNVERIFIED if it contradicts the prior.
+pose is an average, and UNVERIFIED if it contradicts the prior or the tie points, as by a wrong one among these.
 
 The covariance of a prior is that of ξ = (v, ω) in T = pose · exp(ξ), in the order and frame of
 `RegistrationResult.covariance`: ξ is expressed at the origin and in the axes of the source. So a GNSS covariance Σ in

@@ -194,6 +194,22 @@ def test_far_surfaces_are_kept_and_far_points_are_not(count, distance):
         assert len(ready(np.concatenate([room, facade[:19]]))) == 2000
 
 
+def test_points_that_are_far_only_without_others_are_averaged_too():
+    """A room of 2 m and returns through a window: the median distance is computed anew without those left out."""
+    rng = np.random.default_rng(4)
+    face = rng.integers(0, 6, 12_000)
+    points = rng.uniform(-1, 1, (12_000, 3))
+    points[np.arange(12_000), face % 3] = np.where(face < 3, -1, 1)
+    points += 0.02 * rng.normal(size=points.shape)
+    outside = rng.normal(size=(100, 3))
+    outside *= rng.uniform(15, 60, (100, 1)) / np.linalg.norm(outside, axis=1, keepdims=True)
+    points = rng.permutation(np.concatenate([points, outside]))
+    with pytest.warns(UserWarning, match="far from all others"):
+        chosen = preprocess(points)
+        expected = preprocess(points, chosen.voxel_size)
+    np.testing.assert_array_equal(chosen.points, expected.points)
+
+
 def test_the_far_end_of_a_sparse_scan_is_kept():
     points = np.asarray(datasets.street(num_frames=2)[0].cloud.points)[::14]
     assert len(ready(points, voxel_size=None)) == len(points)

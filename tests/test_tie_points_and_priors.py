@@ -1,5 +1,6 @@
 """Tie points and priors: against plain sums, SciPy and Gaussian fusion; what they constrain; derivatives; honesty."""
 
+import contextlib
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -11,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mcgicp_jax as mcg
+from mcgicp_jax import Status
 from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, Prior, TiePoints, form_at
 from mcgicp_jax._registration.tie_points_and_prior import checked_measurements
@@ -65,6 +67,8 @@ def test_the_form_is_the_cost(kind):
     fusion = Fusion(start[:3, :3], start[:3, 3], center, radius, form, np.eye(6), nothing, nothing, np.ones(6, bool))
     with jax.enable_x64(True):
         force, stiffness = jax.jit(Fusion.force_and_stiffness)(fusion, Motion(pose[:3, :3], pose[:3, 3]))
+        cost = fusion.cost_of_ties(Motion(pose[:3, :3], pose[:3, 3]))
+    np.testing.assert_allclose(cost, 0 if ties is None else np.sum(residuals(np.zeros(6)) ** 2), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(force, -slope.T @ residuals(np.zeros(6)), rtol=1e-6)
     np.testing.assert_allclose(stiffness, slope.T @ slope, rtol=1e-6)
 
@@ -73,16 +77,17 @@ def test_the_form_is_the_cost(kind):
 
 
 def test_precise_tie_points_decide(corner):
-    """Against SciPy's fit, a few millimetres from where the clouds alone would be."""
+    """Against SciPy's fit, a few millimetres from where the clouds alone would be; they contradict each other."""
     source, target, truth = corner
     points, targets, _ = tie_points(motion((0.004, -0.003, 0.002, 0.002, 0.001, -0.002)) @ truth, source.points, 1e-3)
     precise = np.tile(1e-12 * np.eye(3), (6, 1, 1))
-    result = mcg.register(source, target, mcg.GICP(), tie_points=(points, targets, precise), **OPTIONS)
+    with pytest.warns(UserWarning, match="tie_points: their squared residuals"):
+        result = mcg.register(source, target, mcg.GICP(), tie_points=(points, targets, precise), **OPTIONS)
     means = targets.mean(axis=0), points.mean(axis=0)
     expected, _ = Rotation.align_vectors(targets - means[0], points - means[1])
     np.testing.assert_allclose(result.matrix[:3, :3], expected.as_matrix(), atol=2e-5)
     np.testing.assert_allclose(result.matrix[:3, 3], means[0] - expected.apply(means[1]), atol=4e-5)
-    assert result.converged and result.deviations.max() < 1e-5
+    assert result.status is Status.UNVERIFIED and result.deviations.max() < 1e-5
 
 
 def test_a_precise_prior_has_the_same_effect_and_checks_where_points_are_differentiated(corner):
@@ -161,6 +166,28 @@ def test_uncertain_or_no_tie_points_hardly_change_the_pose(corner, deviation, co
     assert result.converged and np.abs(twist_error(result.matrix, alone.matrix)).max() < 5e-4
     np.testing.assert_allclose(result.deviations, alone.deviations, rtol=0.01)
     np.testing.assert_allclose(result.information, alone.information, rtol=0.02, atol=30)
+
+
+@pytest.mark.parametrize("wrong", ["none", "one", "all"])
+def test_wrong_tie_points_are_told(corner, wrong):
+    """Of six with deviations of 1 cm, one 0.2 m off, or all of other points."""
+    source, target, truth = corner
+    points, targets, covariances = tie_points(truth, source.points, 0.01)
+    if wrong == "one":
+        targets = targets + np.where(np.arange(len(targets)) == 0, 0.2, 0)[:, None]
+    elif wrong == "all":
+        targets = np.roll(targets, 1, axis=0)
+    ties = points, targets, covariances
+
+    def register(points):
+        return mcg.register(
+            source.replace(points=points), target, mcg.GICP(), init=truth, tie_points=ties, **OPTIONS
+        ).status_code
+
+    expected = Status.CONVERGED if wrong == "none" else Status.UNVERIFIED
+    with contextlib.nullcontext() if wrong == "none" else pytest.warns(UserWarning, match="^tie_points: .*UNVERIFIED"):
+        assert Status(int(register(source.points))) is expected
+    assert Status(int(jax.jit(register)(source.points))) is expected
 
 
 def test_tie_points_at_large_coordinates_lose_nothing(corner):

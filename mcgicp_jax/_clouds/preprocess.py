@@ -112,9 +112,6 @@ def preprocessed_in(
             "or preprocess(cloud, None) for all points"
         )
     cloud = finite_rows(cloud, None if grid is None else grid.measured)
-    if grid is not None and grid.columns.shape[1] != len(cloud):
-        # Rows with a channel that is not finite were left out.
-        grid = None
     preprocessed = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
     if checked:
         _warn_of_loss(cloud, preprocessed, num_neighbors)
@@ -154,7 +151,10 @@ def with_neighbors(
     """`preprocess` for a cloud of `finite_rows`, whose grid may be known."""
     voxels, (own_grid,) = voxels_and_grids(voxel_size, cloud)
     if voxels.size is not None:
-        cloud = _downsampled(cloud, grid or own_grid or grid_of(np.asarray(cloud.points)), voxels.size)
+        # A grid lacks rows if some are placeholders only once others are left out, and has too many if rows were left
+        # out for their channels.
+        complete = [numbered for numbered in (grid, own_grid) if numbered and numbered.columns.shape[1] == len(cloud)]
+        cloud = _downsampled(cloud, complete[0] if complete else grid_of(np.asarray(cloud.points)), voxels.size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     # Clouds far from zero are centred, at a float32 origin, which has the same value inside a transformation.

@@ -122,8 +122,11 @@ def run_differentiated(
                     f"priors[{pair.index}]: expected clouds with concrete origins with an executor, got tracers"
                 )
             prepared[pair.index] = ready
-            source, target, *_ = ready.inputs.values()
-            start = ready.init, primal(ready.prior), ready.traced, ready.doubt, ready.max_coarse_distance
+            values = ready.inputs.values()
+            source, target = values[:2]
+            # In this process, what was made of a traced one.
+            prior: Any = values.prior if executor == "threads" else ready.prior
+            start = ready.init, prior, ready.traced, ready.doubt, ready.max_coarse_distance
             yield Pair(pair.index, source, target, *start)
 
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))

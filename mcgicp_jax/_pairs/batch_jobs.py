@@ -28,6 +28,7 @@ from mcgicp_jax._local_geometry.sensor_patterns import doubt_of_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import doubt_of, doubt_of_start_pose, start_from_anywhere
+from mcgicp_jax._pose_solver.pose_measurements import Prior
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.chunks import ChunkPair, Refused, run_pairs
 from mcgicp_jax._registration.input_checks import (
@@ -264,7 +265,10 @@ class BatchJob:
     def _sent(self, pair: Pair) -> PreparedPair:
         """A pair of `run_differentiated`, of values."""
         values: Any = (pair.source, pair.target, self.method, self.options.robust)
-        inputs = Inputs(*values)._replace(prior=checked_measurements(None, pair.prior, *values[:2])[1])
+        prior: Any = pair.prior
+        if not isinstance(prior, Prior):
+            prior = checked_measurements(None, prior, *values[:2])[1]
+        inputs = Inputs(*values)._replace(prior=prior)
         return PreparedPair(pair.index, inputs, cast(Pose, pair.init), None, pair.doubt, pair.max_coarse_distance)
 
     @_of_a_pair

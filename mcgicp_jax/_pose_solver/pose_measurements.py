@@ -18,12 +18,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
+import numpy as np
+import scipy.special
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._math.poses import adjoint_to_source, translation_adjoint, units
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
 from mcgicp_jax._pose_solver.matched import Motion
+
+# Probability with which right tie points, or a right prior, seem to be contradicted.
+_UNLIKELY = 1e-6
 
 
 class TiePoints(NamedTuple):
@@ -51,13 +56,18 @@ class PoseForm(NamedTuple):
 
     Attributes:
         stiffness, force: Q and G, with D flattened row by row and Δt in units of the radius.
+        energy: e.
         prior: relative to the source point at c and to c, lengths in units of the radius; without one its information
             is 0.
+        most: the cost that right tie points exceed in one of a million cases (χ² with 3 n degrees of freedom); infinite
+            without tie points.
     """
 
     stiffness: Float[AnyArray, "12 12"]
     force: Float[AnyArray, "12"]
+    energy: Float[AnyScalar, ""]
     prior: Prior
+    most: Float[AnyScalar, ""]
 
 
 def form_at(
@@ -70,7 +80,7 @@ def form_at(
 ) -> PoseForm:
     """The costs relative to the pose R, t, about a centre. NumPy where everything is concrete."""
     xp = numpy_for(rotation, translation, center, radius, ties, prior)
-    stiffness, force = xp.zeros((12, 12)), xp.zeros(12)
+    stiffness, force, energy, most = xp.zeros((12, 12)), xp.zeros(12), xp.zeros(()), np.inf
     if ties is not None:
         information = inverse_3(ties.covariances)
         moved = ties.source @ rotation.T + translation
@@ -78,14 +88,18 @@ def form_at(
         forces = xp.einsum("nij,nj->ni", information, ties.target - moved)
         stiffness = stiffness + xp.einsum("nij,nk,nl->ikjl", information, arms, arms).reshape(12, 12)
         force = force + xp.einsum("ni,nk->ik", forces, arms).reshape(12)
+        energy = energy + xp.sum(forces * (ties.target - moved))
+        most = float(scipy.special.chdtri(3 * len(moved), _UNLIKELY)) if len(moved) else np.inf
+    most = xp.asarray(most, energy.dtype)
     if prior is None:
-        return PoseForm(stiffness, force, Prior(rotation, xp.zeros(3), xp.zeros((6, 6))))
+        return PoseForm(stiffness, force, energy, Prior(rotation, xp.zeros(3), xp.zeros((6, 6))), most)
     point = rotation.T @ (center - translation)
     offset = (prior.rotation @ point + prior.translation - center) / radius
     # ξ about the origin of the source from ξ about the point, with lengths in units of the radius.
     change = translation_adjoint(point) * units(radius)
     fixed = None if prior.fixed is None else prior.fixed @ change
-    return PoseForm(stiffness, force, Prior(prior.rotation, offset, change.T @ prior.information @ change, fixed))
+    prior = Prior(prior.rotation, offset, change.T @ prior.information @ change, fixed)
+    return PoseForm(stiffness, force, energy, prior, most)
 
 
 class PoseMeasurements(eqx.Module):
@@ -124,6 +138,13 @@ class PoseMeasurements(eqx.Module):
 
         residual, jvp = jax.linearize(residual_at, jnp.zeros(6, dtype))
         return residual, jax.vmap(jvp)(jnp.eye(6, dtype=dtype))
+
+    def cost_of_ties(self, motion: Motion) -> Float[Array, ""]:
+        """Cost of the tie points at a pose, squared standard deviations."""
+        turn, shift = self._change(motion)
+        change = jnp.concatenate([turn, shift[:, None] / self.radius], axis=1) - jnp.eye(3, 4, dtype=shift.dtype)
+        change, form = change.reshape(12), self.form
+        return form.energy - 2 * form.force @ change + change @ form.stiffness @ change
 
     def force_and_stiffness(self, motion: Motion) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """γ, and its stiffness JᵀQJ, at a pose."""

@@ -340,7 +340,7 @@ def update(
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
         (settled & degenerate, Status.DEGENERATE),
-        (settled & ((squares_from_prior(pose, measurements) > CONTRADICTION) | doubtful), Status.UNVERIFIED),
+        (settled & (doubtful | contradicts_measurements(pose, measurements)), Status.UNVERIFIED),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (coarse & ~converged, COARSE),
@@ -364,13 +364,21 @@ def update(
     )
 
 
-def squares_from_prior(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Float[AnyScalar, ""]:
-    """Squared distance of a pose from the prior, in its standard deviations, once it is weighed; else 0."""
+def squared_residuals(
+    pose: jaxlie.SE3, measurements: PoseMeasurements | None
+) -> tuple[Float[AnyScalar, ""], Float[AnyScalar, ""]]:
+    """Squared standard deviations of the prior, and of the tie points, at a pose, once they are weighed; else 0."""
     if not isinstance(measurements, Fusion):
-        return np.float32(0)
-    rotation = pose.rotation().as_matrix().astype(measurements.center.dtype)
-    residual, _ = measurements.prior_residual(Motion(rotation, pose.translation()))
-    return residual @ measurements.form.prior.information @ residual
+        return np.float32(0), np.float32(0)
+    motion = Motion(pose.rotation().as_matrix().astype(measurements.center.dtype), pose.translation())
+    residual, _ = measurements.prior_residual(motion)
+    return residual @ measurements.form.prior.information @ residual, measurements.cost_of_ties(motion)
+
+
+def contradicts_measurements(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Bool[AnyScalar, ""]:
+    from_prior, from_ties = squared_residuals(pose, measurements)
+    most = np.inf if measurements is None else measurements.form.most
+    return (from_prior > CONTRADICTION) | (from_ties > most)
 
 
 def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:

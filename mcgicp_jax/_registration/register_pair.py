@@ -45,7 +45,7 @@ from mcgicp_jax._registration.input_checks import (
     warn_of_hard_matches,
     warn_of_inputs,
 )
-from mcgicp_jax._registration.loop import CONTRADICTION, LoopResult, Problem, squares_from_prior
+from mcgicp_jax._registration.loop import CONTRADICTION, LoopResult, Problem, squared_residuals
 from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
 from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
@@ -233,9 +233,15 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         return run
     status = run.loop.state.status
     if status == Status.UNVERIFIED:
-        square = squares_from_prior(run.loop.state.pose, run.problem.measurements)
-        if square > CONTRADICTION:
-            doubt = f"prior: the pose is {np.sqrt(square):.2g} standard deviations away from it, and UNVERIFIED"
+        from_prior, from_ties = squared_residuals(run.loop.state.pose, run.problem.measurements)
+        if from_prior > CONTRADICTION:
+            doubt = f"prior: the pose is {np.sqrt(from_prior):.2g} standard deviations away from it, and UNVERIFIED"
+        elif run.problem.measurements is not None and from_ties > run.problem.measurements.form.most:
+            most = run.problem.measurements.form.most
+            doubt = (
+                f"tie_points: their squared residuals add up to {from_ties:.2g} squared standard deviations, those of "
+                f"right ones to at most {most:.2g}, and the pose is UNVERIFIED; some may be wrong, or more uncertain"
+            )
         else:
             doubt = doubt_of_patterns(run.inputs.source)
         run = run._replace(doubt=doubt)

@@ -44,9 +44,10 @@ class Status(enum.IntEnum):
             than 10 % of the source points have a match; less than 60 % lie on the target, and with a smaller
             `max_distance` the same start leads to another pose; the surfaces coincide about as well at that other pose;
             with the coarse `max_distance` the registration does not converge; with `init="global"`, `global_pose` had
-            no success; the pose contradicts the `prior`, by more standard deviations than in one of a million right
-            cases; or channels alone hold it along some direction, and are so simple a function of position that they
-            may move with the sensor, or outside of transformations, differ at matched points as by another exposure.
+            no success; the pose contradicts the `prior` or the `tie_points`, by more standard deviations than in one of
+            a million right cases; or channels alone hold it along some direction, and are so simple a function of
+            position that they may move with the sensor, or outside of transformations, differ at matched points as by
+            another exposure.
     """
 
     CONVERGED = 0
@@ -80,8 +81,8 @@ _ADVICE = {
     Status.INVALID_INPUT: "register raises an error for this pair; see its warning",
     Status.WORKER_FAILED: "two workers failed with this pair; try register, or smaller clouds",
     Status.UNVERIFIED: "the clouds may not show the same place, few points match, other poses fit as well, the prior "
-    "contradicts it, or channels hold it that may move with the sensor or have another exposure; look at the clouds at "
-    "this pose, or try clouds that show more of the scene",
+    "or tie points contradict it, or channels hold it that may move with the sensor or have another exposure; look at "
+    "the clouds at this pose, or try clouds that show more of the scene",
 }
 
 
