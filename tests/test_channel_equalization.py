@@ -156,3 +156,10 @@ def test_parameters_are_chosen_from_the_channels_as_they_are_equalised():
     mcg.register(mcg.preprocess(mcg.PointCloud(*seen), None), target, Recorded(), equalize_channels=True)
     by_all, by_matches = errors
     assert by_matches < 1e-3 < 0.1 < by_all
+
+
+def test_without_channels_there_is_nothing_to_equalize(recwarn):
+    clouds = [mcg.preprocess(room_corner(300, seed=seed)[0]) for seed in (0, 1)]
+    results = [mcg.register(*clouds, mcg.GICP(), max_distance=0.5, equalize_channels=value) for value in (True, False)]
+    np.testing.assert_array_equal(results[0].matrix, results[1].matrix)
+    assert not recwarn.list

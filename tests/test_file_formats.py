@@ -725,7 +725,7 @@ def two_points(names, channels, points=1.0):
             (suffix, make(names), "channel_names", "npz")
             for suffix in NAMED
             if suffix != ".npz"
-            for names in (("two words",), ("naïve",), ("a,b",), ("",), ("a", "a"))
+            for names in (("two words",), ("naïve",), ("a,b",), ("",))
         ),
         (".ply", make(num_points=0), "cloud", ""),
         (".ply", PointCloud.stack([make(), make()]), "cloud", ""),

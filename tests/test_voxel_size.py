@@ -8,6 +8,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
+from mcgicp_jax._clouds.voxel_size import Shape, _without_lines
 from tests.precision import in_float64
 from tests.refusals import refused
 
@@ -201,3 +202,30 @@ def test_raw_scans_two_frames_apart_are_registered(data, rows):
     for method in (mcg.PointToPlane(), mcg.GICP(), mcg.MultiChannelGICP()):
         result = mcg.register(source.cloud, target.cloud, method)
         assert result.converged and mcg.metrics.pose_error(result.matrix, truth)[0] < 0.06
+
+
+class Measured:
+    """A cloud whose neighbourhoods have these fractions of lines and thicknesses, by the number of the voxel size."""
+
+    def __init__(self, lines, thickness):
+        self._shapes = [Shape(*shape, 0.01) for shape in zip(lines, thickness, strict=True)]
+
+    def shows_scene(self, step):
+        return step < 6
+
+    def shape(self, step):
+        return self._shapes[-1 if step is None else step]
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        # The last size has few, but makes neighbourhoods thick; that of all points comes last.
+        pytest.param([0.24, 0.17, 0.13, 0.10, 0.12, 0.03, 0.25], 2, id="posts and edges"),
+        pytest.param([0.24, 0.17, 0.04, 0.03, 0.02, 0.01, 0.25], 2, id="few"),
+        pytest.param([0.9, 0.9, 0.8, 0.7, 0.6, 0.03, 0.9], None, id="a planar scan"),
+    ],
+)
+def test_a_small_size_with_nearly_the_fewest_lines(lines, expected):
+    cloud = Measured(lines, [0.1, 0.1, 0.2, 0.25, 0.28, 0.5, 0.1])
+    assert _without_lines([cloud], None, range(7)) == expected

@@ -119,6 +119,6 @@ def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
         colored = colors.shape == coordinates.shape and len(colors) > 0
         return coordinates, *((colors, COLORS) if colored else (None, None))
     if not (hasattr(points, "__len__") or hasattr(points, "__array__")) or isinstance(points, dict):
-        advice = "pass its cloud" if hasattr(points, "cloud") else "pass its coordinates as an array"
+        advice = "pass its cloud" if hasattr(points, "cloud") else "pass coordinates as an array"
         raise ValueError(f"points: expected (N, 3), got {type(points).__name__}; {advice}")
     return points, None, None

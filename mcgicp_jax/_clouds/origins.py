@@ -20,7 +20,7 @@ from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from
 def are_zero(*origins: Array | np.ndarray) -> bool:
     """Whether origins are zero, which a tracer may not be."""
     # Operations on JAX's arrays are traced inside `jit`, those of a cloud that another `jit` returned among them.
-    return is_concrete(origins) and not any(np.asarray(origin).any() for origin in origins)
+    return is_concrete(origins) and not any(map(np.any, map(np.asarray, origins)))
 
 
 @with_settings_of_package

@@ -138,6 +138,8 @@ def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
     names = _default_names(count) if names is None else tuple(names)
     if len(names) != count:
         raise ValueError(f"channel_names: expected {count} names, got {len(names)}")
+    if len(set(names)) < count:
+        raise ValueError(f"channel_names: expected different names, got {names}")
     return names
 
 
@@ -220,6 +222,8 @@ class PointCloud(eqx.Module):
             channels, channel_names = columns, channel_names or names
             if channel_valid is None and np.isnan(columns).any():
                 channel_valid = ~np.isnan(columns)
+        if getattr(getattr(points, "dtype", None), "kind", "") == "b":
+            raise ValueError("points: expected coordinates in metres, got booleans")
         self.points = _as_float("points", points)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")
@@ -560,8 +564,11 @@ def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
     if not isinstance(cloud, PointCloud):
         with messages_named(name):
             cloud = PointCloud(cloud)
-    if isinstance(cloud.points, np.ndarray):
-        return cloud
+    return cloud if isinstance(cloud.points, np.ndarray) else with_constants(cloud)
+
+
+def with_constants(cloud: PointCloud) -> PointCloud:
+    """The cloud `with_numpy_constants`."""
     constant = with_numpy_constants(cloud)
     # Pytrees do not have the voxels of a cloud.
     return cloud if constant is cloud else constant.replace_rows(voxels=cloud.voxels)

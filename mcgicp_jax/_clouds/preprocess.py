@@ -52,9 +52,9 @@ def preprocess(
         cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
         voxel_size: metres. Points and channels are averaged per voxel, each channel over the points that have it. The
             grid of voxels is turned, differently for each cloud, so that planes along the axes are not biased.
-            "auto": the smallest size at which at most 5 % of the neighbourhoods are lines, such as scan lines (but not
-            one that makes them thicker than 0.3 of their width), and at most 40,000 voxels remain; a larger one where
-            noise makes neighbourhoods thicker than that.
+            "auto": the smallest size at which at most 5 % of the neighbourhoods are lines, such as scan lines (or
+            nearly as few as at any size, where others would make them thicker than 0.3 of their width), and at most
+            40,000 voxels remain; a larger one where noise makes neighbourhoods thicker than that.
             Points that are spread evenly are kept as they are, as are clouds of fewer than 500 points or with
             covariances. The repr of the result says what was chosen and why. None keeps every point.
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at

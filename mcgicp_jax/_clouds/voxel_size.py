@@ -41,8 +41,10 @@ _LINE = 0.2
 # Largest fraction of lines. Raw scans that were registered decimetres to metres off had 29 to 83 %, and 2 to 4 % in
 # voxels of the best size.
 _MOST_LINES = 0.05
-# Where no size reaches that, the fraction must fall to this part of what it was; in a planar scan it does not fall.
-_FEWER = 0.5
+# Where no size reaches that, the fewest must be this part of what there was, since in a planar scan all remain. The
+# smallest size with at most `_NEARLY` times the fewest is taken, since posts and edges are lines in any voxels
+# (measured: Constants in `tests/benchmarks/README.md`).
+_FEWER, _NEARLY = 0.5, 1.5
 # Median thickness of neighbourhoods (third extent over the second) from which larger voxels are tried. Raw corridors
 # that noise made look constrained had 0.4 and more, and 20 points that fill a ball have 0.77. Voxels that leave few
 # lines are no larger than this allows, either: in a forest few are lines only where voxels mix trunks with the ground.
@@ -166,7 +168,7 @@ def _suitable_voxels(grids: Sequence[Grid]) -> Voxels:
     start = max(smallest, _step_of(shape.spacing or 1.0)) if step is None else step
     if shape.lines > _MOST_LINES:
         larger = _without_lines(clouds, step, range(start, largest))
-        if larger is not None and _worst_shape(clouds, larger).lines <= max(_MOST_LINES, _FEWER * shape.lines):
+        if larger is not None:
             step, reason = larger, f"{shape.lines:.0%} of the neighbourhoods were lines"
     thickness = _worst_shape(clouds, step).thickness
     if thickness > _THICK:
@@ -228,8 +230,8 @@ def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
 
 
 def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) -> int | None:
-    """The smallest size with few lines, or else the largest at which all clouds show the scene and neighbourhoods are
-    no thicker than `_THICK`, or than they are at `step`. None: there is none."""
+    """The smallest size with few lines, or else with nearly the fewest of all sizes, at which all clouds show the scene
+    and neighbourhoods are no thicker than `_THICK`, or than they are at `step`. None: there is none."""
 
     def suffices(cloud: _Averages, larger: int) -> bool:
         return not cloud.shows_scene(larger) or cloud.shape(larger).lines <= _MOST_LINES
@@ -240,12 +242,19 @@ def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) 
     for cloud in others:
         while larger < steps.stop and not suffices(cloud, larger):
             larger += 1
-    thick = max(_THICK, _worst_shape(clouds, step).thickness)
-    while larger >= steps.start and not (
-        all(cloud.shows_scene(larger) for cloud in clouds) and _worst_shape(clouds, larger).thickness <= thick
-    ):
-        larger -= 1
-    return larger if larger >= steps.start else None
+    before = _worst_shape(clouds, step)
+
+    def is_allowed(size: int) -> bool:
+        shown = all(cloud.shows_scene(size) for cloud in clouds)
+        return shown and _worst_shape(clouds, size).thickness <= max(_THICK, before.thickness)
+
+    if larger < steps.stop and is_allowed(larger):
+        return larger
+    lines = {size: _worst_shape(clouds, size).lines for size in steps if is_allowed(size)}
+    fewest = min(lines.values(), default=1.0)
+    if fewest > max(_MOST_LINES, _FEWER * before.lines):
+        return None
+    return next(size for size, fraction in lines.items() if fraction <= max(_MOST_LINES, _NEARLY * fewest))
 
 
 def _thinner(clouds: Sequence[_Averages], thickness: float, start: int) -> int | None:

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from mcgicp_jax._clouds.origins import centred_pose
-from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, with_constants
 from mcgicp_jax._compute.concrete import (
     AnyArray,
     constant,
@@ -81,9 +81,8 @@ def mahalanobis_cost(
             missing or not positive, a cloud lacks the neighbours that the method needs, or `log_determinant` is set for
             another method.
     """
-    source, target = as_cloud("source", source), as_cloud("target", target)
-    matches = with_numpy_constants(matches)
     check_matches(matches, source, target, method, temperature)
+    source, target, matches = with_constants(source), with_constants(target), with_numpy_constants(matches)
     photometric = isinstance(method, MultiChannelGICP) and method.photometric
     if log_determinant and (photometric or not isinstance(method, AbstractGeneralized)):
         name = type(method).__name__ + "(photometric=True)" * photometric

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-import scipy.special
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
@@ -89,6 +88,9 @@ def form_at(
         stiffness = stiffness + xp.einsum("nij,nk,nl->ikjl", information, arms, arms).reshape(12, 12)
         force = force + xp.einsum("ni,nk->ik", forces, arms).reshape(12)
         energy = energy + xp.sum(forces * (ties.target - moved))
+        # Imported late, like all of SciPy but its trees.
+        import scipy.special
+
         most = float(scipy.special.chdtri(3 * len(moved), _UNLIKELY)) if len(moved) else np.inf
     most = xp.asarray(most, energy.dtype)
     if prior is None:

@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.origins import centred_pose
-from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, with_constants
 from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import constant, constants_computed, is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
@@ -58,11 +58,11 @@ def find_correspondences(
             channels or dtypes do not fit.
     """
     # Matches are constants to autodiff.
-    source, target = as_cloud("source", source), as_cloud("target", target)
     source, target, pose, method, max_distance = map(primal, (source, target, pose, method, max_distance))
     traced = not is_concrete(source, target, pose, method, max_distance)
     search = search or default_search(traced)
     check_clouds(source, target, method)
+    source, target = (with_constants(cloud) if traced else cloud for cloud in (source, target))
     method = method.resolve(source, target)
     check_positive("max_distance", max_distance)
     num_candidates = method.num_candidates if num_candidates is None else num_candidates

@@ -188,7 +188,8 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
 
     if not traced:
         warn_of_inputs(given.source, given.target, given.method, options.equalize_channels)
-    *coarse, inputs = _at_scales(_equalized(given) if options.equalize_channels else given, options.voxel_sizes)
+    equalizes = options.equalize_channels and given.source.channels.shape[-1] > 0
+    *coarse, inputs = _at_scales(_equalized(given) if equalizes else given, options.voxel_sizes)
     start = init
     for scale in coarse:
         run = solve(scale, start, replace(options, max_distance=None))
@@ -199,7 +200,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         run, doubt = _unless_left(
             run, init, len(coarse) > 0, lambda limit: solve(inputs, init, replace(options, max_distance=limit))
         )
-    if options.equalize_channels and not any(term.estimates_gains for term in run.problem.terms):
+    if equalizes and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run))
         run = solve(again, _final_pose(run), replace(options, max_coarse_distance=0.0))

@@ -71,10 +71,8 @@ def columns_of(cloud: PointCloud) -> Columns:
     """The named columns to write for a cloud; colours as uint8 if that is lossless."""
     names = cloud.channel_names
     for name in names:
-        if not re.fullmatch(r"[A-Za-z0-9_.\-]+", name) or names.count(name) > 1:
-            raise ValueError(
-                f"channel_names: expected unique names of letters, digits, _ . -, got {name!r}; .npz can hold it"
-            )
+        if not re.fullmatch(r"[A-Za-z0-9_.\-]+", name):
+            raise ValueError(f"channel_names: expected letters, digits, _ . -, got {name!r}; .npz can hold it")
     columns = dict(zip("xyz", cloud.points.T, strict=True))
     for name, values in zip(names, cloud.channels.T, strict=True):
         # The prefix keeps names that readers would skip or change.

@@ -42,8 +42,9 @@ COLUMNS = [
     "pairs/s",
     "chunks",
     "device busy",
-    "host per pair",
+    "host per pair, chunk",
     "apart, median, largest",
+    "other statuses",
 ]
 BY_JIT = ["pairs", "method", "first call", "pairs/s", "with gradient: first call", "pairs/s"]
 
@@ -94,13 +95,15 @@ def batch_row(name: str, method_name: str, pairs: list[Any]) -> list[str]:
 
     with mock.patch.object(chunks, "_registered", awaited):
         batch()
+    host = max(0, seconds - sum(device))
     options.pop("covariances")
-    apart = []
+    apart, others = [], 0
     for (source, target), result in zip(pairs[:COMPARED], results, strict=False):
         clouds = (mcg.preprocess(cloud, None) for cloud in (source, target))
         options.pop("voxel_size", None)
         alone = mcg.register(*clouds, method, search=mcg.KDTreeSearch(1), **options)
         apart.append(max(mcg.metrics.pose_error(result.matrix, alone.matrix)))
+        others += result.status is not alone.status
     return [
         name,
         method_name,
@@ -108,9 +111,24 @@ def batch_row(name: str, method_name: str, pairs: list[Any]) -> list[str]:
         f"{len(pairs) / seconds:.0f}",
         str(len(device)),
         f"{min(1, sum(device) / seconds):.0%}",
-        f"{1e3 * max(0, seconds - sum(device)) / len(pairs):.2f} ms",
+        f"{1e3 * host / len(pairs):.2f}, {1e3 * host / len(device):.0f} ms",
         f"{np.median(apart):.1e}, {max(apart):.1e}",
+        f"{others} of {len(apart)}",
     ]
+
+
+def differentiated_row(name: str, method_name: str, pairs: list[Any]) -> list[str]:
+    """Value and gradient of `register_batch` by the points of its sources, which the host computes."""
+    method, targets = METHODS[method_name], [target for _, target in pairs]
+
+    def loss(points: list[Any]) -> Any:
+        sources = [source.replace(points=moved) for (source, _), moved in zip(pairs, points, strict=True)]
+        results = mcg.register_batch(sources, targets, method, voxel_size=None, **OPTIONS)
+        return sum(jnp.sum(result.matrix[:3, 3] ** 2) for result in results)
+
+    points = [jnp.asarray(source.points) for source, _ in pairs]
+    first, seconds, _ = timed(lambda: jax.value_and_grad(loss)(points))
+    return [name, method_name, f"{first:.1f} s", f"{len(pairs) / seconds:.0f}"]
 
 
 def transformed_row(name: str, method_name: str, pairs: list[Any]) -> list[str]:
@@ -159,6 +177,10 @@ def main() -> None:
         for method in METHODS
     ]
     print_table(BY_JIT, rows)
+    rows = [
+        differentiated_row("64 × 2,000", method, random_pairs(max(2, 64 // scale), 2000, 2000)) for method in METHODS
+    ]
+    print_table(["gradient of a batch", "method", "first call", "pairs/s"], rows)
 
 
 if __name__ == "__main__":
