@@ -336,11 +336,14 @@ def update(
     finite = jnp.isfinite(sums.energy) & jnp.all(jnp.isfinite(moved.wxyz_xyz))
     by_channels = False if directions is None else jnp.any(directions.constrained_by_channels)
     doubtful = settings.channels_may_move & by_channels
+    from_prior, from_ties = squared_residuals(pose, measurements)
+    most = np.inf if measurements is None else measurements.form.most
+    contradicted = (from_prior > CONTRADICTION) | (from_ties > most)
     outcomes: tuple[tuple[Array, int], ...] = (
         (sums.num_inliers < _MIN_CORRESPONDENCES, Status.TOO_FEW_CORRESPONDENCES),
         (~finite, Status.NON_FINITE),
         (settled & degenerate, Status.DEGENERATE),
-        (settled & (doubtful | contradicts_measurements(pose, measurements)), Status.UNVERIFIED),
+        (settled & (contradicted | doubtful), Status.UNVERIFIED),
         (settled, Status.CONVERGED),
         (num_iterations >= settings.max_iterations, Status.MAX_ITERATIONS),
         (coarse & ~converged, COARSE),
@@ -373,12 +376,6 @@ def squared_residuals(
     motion = Motion(pose.rotation().as_matrix().astype(measurements.center.dtype), pose.translation())
     residual, _ = measurements.prior_residual(motion)
     return residual @ measurements.form.prior.information @ residual, measurements.cost_of_ties(motion)
-
-
-def contradicts_measurements(pose: jaxlie.SE3, measurements: PoseMeasurements | None) -> Bool[AnyScalar, ""]:
-    from_prior, from_ties = squared_residuals(pose, measurements)
-    most = np.inf if measurements is None else measurements.form.most
-    return (from_prior > CONTRADICTION) | (from_ties > most)
 
 
 def root_of(state: State, fusion: Fusion | None) -> ImplicitRoot:
