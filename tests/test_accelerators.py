@@ -9,12 +9,14 @@ import sys
 import textwrap
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
+from unittest import mock
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
 import mcgicp_jax as mcg
 from mcgicp_jax import extend
@@ -117,7 +119,7 @@ class ForFewPairs(mcg.DenseSearch):
 )
 def test_chunks_are_as_large_as_memory_allows(memory, size):
     device = SimpleNamespace(platform="gpu", memory_stats=lambda: memory)
-    group = chunks._Group(None, SimpleNamespace(devices=[device]), 64)
+    group = chunks._Group(print, mock.Mock(spec=Mesh, devices=[device]), 64)
     cloud = SimpleNamespace(valid=np.ones(2048))
     group.waiting.append((0, (None, None, cloud, cloud)))
     assert group._largest() == size

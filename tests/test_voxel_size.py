@@ -8,7 +8,7 @@ import pytest
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets
-from mcgicp_jax._clouds.voxel_size import Shape, _without_lines
+from mcgicp_jax._clouds.voxel_size import Shape, _Averages, _without_lines
 from tests.precision import in_float64
 from tests.refusals import refused
 
@@ -204,7 +204,7 @@ def test_raw_scans_two_frames_apart_are_registered(data, rows):
         assert result.converged and mcg.metrics.pose_error(result.matrix, truth)[0] < 0.06
 
 
-class Measured:
+class Measured(_Averages):
     """A cloud whose neighbourhoods have these fractions of lines and thicknesses, by the number of the voxel size."""
 
     def __init__(self, lines, thickness):

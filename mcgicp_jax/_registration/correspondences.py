@@ -85,7 +85,7 @@ def find_correspondences(
             near = distances <= gate
     else:
         limit = jnp.asarray(max_distance, dtype)
-        nearest = search.nearest_traced(start, rows, target_rows, limit, jnp.bool_(True), num_candidates)
+        nearest = search.nearest_traced(jnp.asarray(start), rows, target_rows, limit, jnp.bool_(True), num_candidates)
         indices = jnp.maximum(nearest, 0)
         moved = Motion(jnp.asarray(matrix[:3, :3], dtype), jnp.asarray(matrix[:3, 3], dtype)).move(rows.points)
         targets = jnp.asarray(target_rows.points)[indices]
