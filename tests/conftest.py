@@ -14,7 +14,7 @@ os.environ.setdefault(
     + " --xla_cpu_use_fusion_emitters=false"
     * (tuple(map(int, importlib.metadata.version("jaxlib").split(".")[:3])) < (0, 11, 1)),
 )
-# Many tests are about the host. JAX_PLATFORMS=cuda runs all on a GPU.
+# Many tests are about the host. JAX_PLATFORMS=cuda,cpu runs all on a GPU.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Keep all compiled programs between runs.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(pathlib.Path(__file__).parent.parent / ".jax_cache"))

@@ -63,7 +63,7 @@ def test_arguments_that_are_swapped_or_in_the_wrong_form_are_named():
         ("poses", lambda: mcg.plot.before_after(raw, raw, [still]), "poses by name", "list"),
         ("channel_names", lambda: raw.replace(channels=POINTS, channel_names=()), 3, 0),
         ("channel_names", lambda: raw.replace(channels=POINTS, channel_names=("a", "b", "a")), "different names"),
-        ("points", lambda: mcg.PointCloud(POINTS > 0), "booleans"),
+        ("points", lambda: mcg.PointCloud((POINTS > 0).tolist()), "bool"),
     ):
         refused(call, named, *told)
     with pytest.raises(AttributeError, match=r"^points: .* cloud\.replace\(points=\.\.\.\)"):

@@ -59,6 +59,23 @@ def test_order_and_number_of_workers_change_nothing(raw, alone):
             assert_same(batch(*sides, executor=threads), [alone[i] for i in order])
 
 
+class Broken(mcg.GICP):
+    """A method of a user that raises."""
+
+    def covariance(self, around, local):
+        raise TypeError("a mistake")
+
+
+def test_mistakes_of_a_method_are_raised_while_a_batch_is_differentiated():
+    cloud = mcg.preprocess(np.random.default_rng(0).random((300, 3)), None)
+
+    def loss(points):
+        return mcg.register_batch([cloud.replace(points=points)], [cloud], Broken())[0].matrix.sum()
+
+    with pytest.raises(TypeError, match="a mistake"):
+        jax.grad(loss)(cloud.points)
+
+
 SPOILED = {
     "empty": np.zeros((0, 3)),
     "one point": np.zeros((1, 3)),

@@ -250,6 +250,20 @@ def test_gradients_by_default_where_processes_pay(raw, pays, monkeypatch):
     told(os.getpid)
     gradient = jax.grad(loss)(source.points, None, 30 * num_cores())
     assert 0 < by_workers.call_count < 30 * num_cores()
+    results = []
+
+    def cost(points, executor):
+        clouds = [source.replace_rows(points=points)] * 2
+        results.extend(
+            mcg.register_batch(clouds, target, METHOD, executor=executor, covariances=False, max_distance=0.5)
+        )
+        return results[-1].cost
+
+    # Wherever a pair ran.
+    for executor in ("threads", "processes"):
+        with pytest.raises(NotImplementedError):
+            jax.grad(cost)(source.points, executor)
+    assert all(np.isnan(np.asarray(jax.lax.stop_gradient(result.deviations))).all() for result in results)
     expected = jax.grad(loss)(source.points, "threads", 2)
     np.testing.assert_allclose(gradient, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
 

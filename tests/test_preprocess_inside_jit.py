@@ -186,6 +186,9 @@ def test_clouds_of_one_program_may_be_constants_of_another(method):
         np.testing.assert_allclose(constant, function(source, target), rtol=1e-6, atol=1e-6)
         jax.eval_shape(lambda points, function=function: function(moved(points), target), source.points)
         jax.eval_shape(lambda points, function=function: function(target, moved(points)), source.points)
+    # Arrays of both kinds, as after `replace`.
+    mixed = source.replace_rows(points=np.asarray(source.points))
+    jax.eval_shape(lambda points: pose(mixed, target.replace_rows(points=points)), target.points)
 
 
 def test_what_is_missing_is_said():

@@ -190,6 +190,22 @@ def test_wrong_tie_points_are_told(corner, wrong):
     assert Status(int(jax.jit(register)(source.points))) is expected
 
 
+def test_rounding_does_not_contradict_precise_tie_points(corner):
+    """Exact ones with deviations of a micrometre in a scene of 100 m, where float32 has steps of 8 µm."""
+    points, turn = 50 * np.asarray(corner[0].unpad().points, float), motion((1, -2, 0.5, 0.02, -0.01, 0.03))
+    source, target = (mcg.preprocess(side, None) for side in (points, points @ turn[:3, :3].T + turn[:3, 3]))
+    ties = (
+        points[::300],
+        points[::300] @ turn[:3, :3].T + turn[:3, 3],
+        np.tile(1e-12 * np.eye(3), (len(points[::300]), 1, 1)),
+    )
+
+    def register(init):
+        return mcg.register(source, target, mcg.GICP(), init=init, tie_points=ties, max_distance=20.0).status_code
+
+    assert Status(int(register(turn))) is Status(int(jax.jit(register)(turn))) is Status.CONVERGED
+
+
 def test_tie_points_at_large_coordinates_lose_nothing(corner):
     """They decide the pose, with a source far from its origin and a target at UTM coordinates."""
     source, target, truth = corner

@@ -127,7 +127,7 @@ def _pairs_in(path: Path, glob: str) -> Starts:
             raise ValueError(f"{path}: expected a CSV file or a folder; the file is not text") from error
     reader = csv.DictReader(lines, skipinitialspace=True)
     columns = reader.fieldnames or []
-    if not columns:
+    if not any(map(str.strip, lines)):
         raise ValueError(f"{path}: the file is empty")
     if not {"source", "target"} <= set(columns):
         raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")

@@ -55,7 +55,7 @@ def _as_float(name: str, values: Any) -> Any:
         raise ValueError(
             f"{name}: expected an array, got {kind}: {error}; pass NumPy's, of torch tensor.detach().float().numpy()"
         ) from error
-    if array.dtype.kind not in "fiub":
+    if array.dtype.kind not in ("fiu" if name == "points" else "fiub"):
         raise ValueError(f"{name}: expected real numbers, got dtype {array.dtype}")
     array = array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
     return np.where(np.ma.getmaskarray(values), np.nan, array) if np.ma.is_masked(values) else array
@@ -222,8 +222,6 @@ class PointCloud(eqx.Module):
             channels, channel_names = columns, channel_names or names
             if channel_valid is None and np.isnan(columns).any():
                 channel_valid = ~np.isnan(columns)
-        if getattr(getattr(points, "dtype", None), "kind", "") == "b":
-            raise ValueError("points: expected coordinates in metres, got booleans")
         self.points = _as_float("points", points)
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise ValueError(f"points: expected shape (N, 3), got {self.points.shape}{_advice(self.points.shape)}")
@@ -564,7 +562,10 @@ def as_cloud(name: str, cloud: PointCloud | Values) -> PointCloud:
     if not isinstance(cloud, PointCloud):
         with messages_named(name):
             cloud = PointCloud(cloud)
-    return cloud if isinstance(cloud.points, np.ndarray) else with_constants(cloud)
+    # Most clouds hold NumPy arrays, and are asked for several times in a registration.
+    in_numpy = isinstance(cloud.points, np.ndarray) and isinstance(cloud.channels, np.ndarray)
+    mixed = isinstance(cloud.channel_valid, jax.Array) or isinstance(cloud.covariances, jax.Array)
+    return cloud if in_numpy and not mixed else with_constants(cloud)
 
 
 def with_constants(cloud: PointCloud) -> PointCloud:

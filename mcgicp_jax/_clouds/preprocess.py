@@ -52,9 +52,10 @@ def preprocess(
         cloud: raw cloud, or (N, 3) array in metres. Padding and old neighbours are dropped first.
         voxel_size: metres. Points and channels are averaged per voxel, each channel over the points that have it. The
             grid of voxels is turned, differently for each cloud, so that planes along the axes are not biased.
-            "auto": the smallest size at which at most 5 % of the neighbourhoods are lines, such as scan lines (or
-            nearly as few as at any size, where others would make them thicker than 0.3 of their width), and at most
-            40,000 voxels remain; a larger one where noise makes neighbourhoods thicker than that.
+            "auto": the smallest size at which at most 5 % of the neighbourhoods are lines, such as scan lines, and at
+            most 40,000 voxels remain; a larger one where noise makes neighbourhoods thicker than 0.3 of their width.
+            Where no size has so few lines without that, as with posts and edges, the smallest size with at most 1.5
+            times the fewest lines of any, if these are half of those of the points.
             Points that are spread evenly are kept as they are, as are clouds of fewer than 500 points or with
             covariances. The repr of the result says what was chosen and why. None keeps every point.
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
@@ -151,7 +152,7 @@ def with_neighbors(
     """`preprocess` for a cloud of `finite_rows`, whose grid may be known."""
     voxels, (own_grid,) = voxels_and_grids(voxel_size, cloud)
     if voxels.size is not None:
-        # A grid lacks rows if some are placeholders only once others are left out, and has too many if rows were left
+        # A grid lacks the rows that are placeholders only once others are left out. It has too many if rows were left
         # out for their channels.
         complete = [numbered for numbered in (grid, own_grid) if numbered and numbered.columns.shape[1] == len(cloud)]
         cloud = _downsampled(cloud, complete[0] if complete else grid_of(np.asarray(cloud.points)), voxels.size)

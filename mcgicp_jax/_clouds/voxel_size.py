@@ -8,6 +8,7 @@ fault, if the voxels are large enough; larger ones lose detail. Hence the smalle
 from __future__ import annotations
 
 import bisect
+import itertools
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
@@ -231,7 +232,8 @@ def _worst_shape(clouds: Sequence[_Averages], step: int | None) -> Shape:
 
 def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) -> int | None:
     """The smallest size with few lines, or else with nearly the fewest of all sizes, at which all clouds show the scene
-    and neighbourhoods are no thicker than `_THICK`, or than they are at `step`. None: there is none."""
+    and neighbourhoods are no thicker than `_THICK`, or than they are at `step`. None: there is none, or half of the
+    lines remain."""
 
     def suffices(cloud: _Averages, larger: int) -> bool:
         return not cloud.shows_scene(larger) or cloud.shape(larger).lines <= _MOST_LINES
@@ -244,13 +246,15 @@ def _without_lines(clouds: Sequence[_Averages], step: int | None, steps: range) 
             larger += 1
     before = _worst_shape(clouds, step)
 
-    def is_allowed(size: int) -> bool:
-        shown = all(cloud.shows_scene(size) for cloud in clouds)
-        return shown and _worst_shape(clouds, size).thickness <= max(_THICK, before.thickness)
+    def shown(size: int) -> bool:
+        return all(cloud.shows_scene(size) for cloud in clouds)
 
-    if larger < steps.stop and is_allowed(larger):
+    def thin(size: int) -> bool:
+        return _worst_shape(clouds, size).thickness <= max(_THICK, before.thickness)
+
+    if larger < steps.stop and shown(larger) and thin(larger):
         return larger
-    lines = {size: _worst_shape(clouds, size).lines for size in steps if is_allowed(size)}
+    lines = {size: _worst_shape(clouds, size).lines for size in itertools.takewhile(shown, steps) if thin(size)}
     fewest = min(lines.values(), default=1.0)
     if fewest > max(_MOST_LINES, _FEWER * before.lines):
         return None

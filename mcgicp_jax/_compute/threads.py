@@ -76,7 +76,7 @@ def num_cores() -> int:
     return min(count, _quota(), int(limit) if limit.isdecimal() and int(limit) else count)
 
 
-# Files of the quota are read once.
+# Read once, with the affinity and LOKY_MAX_CPU_COUNT of then.
 _quota = functools.cache(loky.cpu_count)
 
 

@@ -43,8 +43,8 @@ def register_batch(
 
     Outside `jit`, the poses have derivatives, as those of `register`, by the points and channels of the clouds, the
     parameters of the method and the priors. They are computed side by side, so that `jax.value_and_grad` of a loss over
-    the poses of many pairs is one call; of pairs in other processes by these, as (7, n) matrices. Clouds and priors
-    must be given in lists then. Inside `jit` and `vmap`, use `register`.
+    the poses of many pairs is one call. Other processes return those of their pairs as (7, n) matrices. Clouds and
+    priors must be given in lists then. Inside `jit` and `vmap`, use `register`.
     """
     checked_options = options_of(register_batch, options)
     job = BatchJob(method, checked_options, voxel_size, num_neighbors, covariances, priors is not None)

@@ -30,7 +30,7 @@ from mcgicp_jax._compute.programs import COMPILATIONS, LOGGER
 from mcgicp_jax._compute.threads import num_cores, with_settings
 from mcgicp_jax._pairs.batch_jobs import NUM_CHECKED, BatchJob, Pair, PairResult, PreparedPair, RanPair
 from mcgicp_jax._pairs.processes import Processes
-from mcgicp_jax._registration.assessment import fields_of_pose
+from mcgicp_jax._registration.assessment import with_traced_pose
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.register_pair import Run, results_of
 from mcgicp_jax._registration.result import RegistrationResult, Status
@@ -89,7 +89,7 @@ def run(
     if executor is None and job.uses_chunks:
         results = map(PairResult.with_warning, job.register_in_chunks(concrete_pairs, num_cores()))
     else:
-        results = _by_executor(job, concrete_pairs, executor, count, job.register_chunk)
+        results = _by_executor(job, concrete_pairs, executor, count)
     for result in results:
         yield result.index, result.registration
 
@@ -103,21 +103,22 @@ def run_differentiated(
     prepared: dict[int, PreparedPair] = {}
     runs: dict[int, Run] = {}
     if executor is None and job.has_priors:
-        # Derivatives by priors.
+        # Other processes return no derivatives by priors.
         executor = "threads"
+    at_home = executor == "threads"
 
     def sent() -> Iterator[Pair]:
         """The values of pairs, each prepared while workers have those before it."""
         for pair in pairs:
-            if executor != "threads" and not is_concrete(pair.prior):
+            if not at_home and not is_concrete(pair.prior):
                 raise ValueError(f"priors[{pair.index}]: expected concrete arrays with an executor, got tracers")
-            ready = job.prepare(pair, executor in (None, "threads") or pair.index < NUM_CHECKED)
+            ready = job.prepare(pair, at_home or executor is None or pair.index < NUM_CHECKED)
             if isinstance(ready, PairResult):
                 results[pair.index] = ready.with_warning().registration
                 continue
             # With a prior, whose pose is in the user's frames, the equation of the centred pose depends on the origins.
             origins = [cloud.origin for cloud in ready.inputs[:2]]
-            if executor != "threads" and ready.prior is not None and not is_concrete(*origins):
+            if not at_home and ready.prior is not None and not is_concrete(*origins):
                 raise ValueError(
                     f"priors[{pair.index}]: expected clouds with concrete origins with an executor, got tracers"
                 )
@@ -125,7 +126,7 @@ def run_differentiated(
             values = ready.inputs.values()
             source, target = values[:2]
             # In this process, what was made of a traced one.
-            prior: Any = values.prior if executor == "threads" else ready.prior
+            prior: Any = values.prior if at_home else ready.prior
             start = ready.init, prior, ready.traced, ready.doubt, ready.max_coarse_distance
             yield Pair(pair.index, source, target, *start)
 
@@ -141,20 +142,24 @@ def run_differentiated(
             origins = ready.inputs.source.origin, ready.inputs.target.origin
             if is_concrete(origins):
                 origins = result.source_origin, result.target_origin
-            result = result.build(**vars(result) | fields_of_pose(jaxlie.SE3(pose), *origins))
+            result = with_traced_pose(result, jaxlie.SE3(pose), *origins, ready.inputs)
         results[answer.index] = result
     differentiated = results_of(list(runs.values()), [prepared[index].inputs for index in runs])
     for (index, run), result in zip(runs.items(), differentiated, strict=True):
         ready = prepared[index]
-        answer = PairResult(index, ready.checked(result), ready.doubt or run.doubt)
-        results[index] = answer.with_warning().registration
+        result = job.with_wanted_fields(ready.checked(result))
+        results[index] = PairResult(index, result, ready.doubt or run.doubt).with_warning().registration
     return [results[index] for index in sorted(results)]
 
 
 def _by_executor(
-    job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None, in_thread: Callable[..., Any]
+    job: BatchJob,
+    pairs: Iterator[Pair],
+    executor: ChosenExecutor,
+    count: int | None,
+    in_thread: Callable[..., Any] | None = None,
 ) -> Iterator[Any]:
-    """The results of pairs; threads of this process get those of a chunk by `in_thread`."""
+    """The results of pairs; threads of this process get those of a chunk by `in_thread`, whose errors are raised."""
     if executor is None:
         yield from _by_threads_then_processes(job, pairs, count, in_thread)
     elif executor == "threads":
@@ -163,13 +168,13 @@ def _by_executor(
         yield from ChunkedExecutor(job, executor).run(pairs)
 
 
-def _by_threads(job: BatchJob, pairs: Iterator[Pair], in_thread: Callable[..., Any]) -> Iterator[Any]:
+def _by_threads(job: BatchJob, pairs: Iterator[Pair], in_thread: Callable[..., Any] | None) -> Iterator[Any]:
     with ThreadPoolExecutor(num_cores(), thread_name_prefix="mcgicp") as threads:
         yield from ChunkedExecutor(job, threads, max_submitted=2 * num_cores(), work=in_thread).run(pairs)
 
 
 def _by_threads_then_processes(
-    job: BatchJob, pairs: Iterator[Pair], count: int | None, in_thread: Callable[..., Any]
+    job: BatchJob, pairs: Iterator[Pair], count: int | None, in_thread: Callable[..., Any] | None
 ) -> Iterator[Any]:
     """Threads register the first pairs, and are timed. If processes pay, they start meanwhile and register the rest."""
     rest: Iterator[Pair] | None = None
@@ -199,7 +204,7 @@ def _by_threads_then_processes(
             start.processes.shutdown(cancel_futures=True)
     if rest is not None and start.processes is not None:
         yield from ChunkedExecutor(job, start.processes, at_home=True).run(rest)
-    elif start.possible and start.processes is None:
+    elif start.possible and start.finished and start.processes is None:
         LOGGER.info("register_batch: %d pairs by threads; to start processes would not pay", start.finished)
 
 
@@ -281,7 +286,7 @@ class ChunkedExecutor:
     A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
     failed chunks are suspects, submitted again at the end one by one: only those that fail alone get `WORKER_FAILED`.
     `at_home`: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
-    `work`: what workers do with a chunk, if not `register_chunk`.
+    `work`: what workers do with a chunk, if not `register_chunk`; its errors are raised.
     """
 
     def __init__(
@@ -300,12 +305,13 @@ class ChunkedExecutor:
             # More submitted chunks than loky's queue holds, so that no worker waits.
             self._chunk_size, self._max_submitted = _SMALL_CHUNK, 4 * executor.num_workers
         job = _as_numpy(job) if self._pickled else job
+        self._raises = work is not None
         work = work or (job.register_chunk_alone if isinstance(executor, Processes) else job.register_chunk)
         self._register = with_settings(work, pickled=self._pickled)
         self._suspects: collections.deque[Pair] = collections.deque()
-        self._submitted: dict[Future[list[PairResult]], list[Pair]] = {}
+        self._submitted: dict[Future[list[PairResult | RanPair]], list[Pair]] = {}
 
-    def run(self, pairs: Iterator[Pair]) -> Iterator[PairResult]:
+    def run(self, pairs: Iterator[Pair]) -> Iterator[PairResult | RanPair]:
         try:
             while chunk := list(itertools.islice(pairs, self._chunk_size)):
                 self._submit(chunk)
@@ -343,19 +349,21 @@ class ChunkedExecutor:
             future = self._executor.submit(self._register, sent)
         self._submitted[future] = chunk
 
-    def _receive(self, last_try: bool = False) -> Iterator[PairResult]:
+    def _receive(self, last_try: bool = False) -> Iterator[PairResult | RanPair]:
         done, _ = futures.wait(self._submitted, return_when=futures.FIRST_COMPLETED)
         for future in done:
             chunk = self._submitted.pop(future)
             try:
                 results = future.result()
             except Exception as error:
+                if self._raises:
+                    raise
                 reason, results = _words(error), []
                 if last_try:
                     failed = RegistrationResult.without_pose(Status.WORKER_FAILED)
                     results = [PairResult(chunk[0].index, failed, f"its worker failed twice ({reason})")]
                 elif isinstance(error, PicklingError) and self._at_home is not None:
-                    results = self._at_home.register_chunk(chunk)
+                    results = [*self._at_home.register_chunk(chunk)]
                 elif isinstance(error, PicklingError):
                     # The message of the error in loky's thread, whose traceback is the text of the cause.
                     lines = [line for line in str(error.__cause__ or error).splitlines() if line.strip(' "')]

@@ -81,7 +81,7 @@ class PairWarning(UserWarning):
 @dataclass(frozen=True)
 class Pair:
     """The arguments of one pair. `traced` numbers the leaves of clouds, method and kernel by which the pose is to be
-    differentiated; if there are any, the other fields are those of a `PreparedPair`."""
+    differentiated; if there are any, the other fields are those of a `PreparedPair`. `prior` may be a `Prior`, too."""
 
     index: int
     source: Cloud
@@ -359,10 +359,12 @@ class BatchJob:
         return ready, ChunkPair(pose, source.points.dtype.type(ready.max_coarse_distance), *sides)
 
     def _result(self, index: int, result: RegistrationResult, doubt: str) -> PairResult:
-        """The result without references to the clouds, and if so wanted without covariance."""
-        if not self.covariances:
-            result = result.build(**vars(result) | {"uncertainty": unknown_uncertainty()})
-        return PairResult(index, computed(result), doubt)
+        """The result without references to the clouds."""
+        return PairResult(index, computed(self.with_wanted_fields(result)), doubt)
+
+    def with_wanted_fields(self, result: RegistrationResult) -> RegistrationResult:
+        """The result, without covariance if so wanted."""
+        return result if self.covariances else result.build(**vars(result) | {"uncertainty": unknown_uncertainty()})
 
 
 def _invalid(index: int, error: ValueError) -> PairResult:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jax.typing import ArrayLike
 
-from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax._compute.concrete import numpy_for
+from mcgicp_jax._clouds.point_cloud import PointCloud, with_constants
+from mcgicp_jax._compute.concrete import numpy_for, with_numpy_constants
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import Pose
@@ -75,6 +75,7 @@ def estimate_pose(
     check_matches(matches, source, target, method, temperature)
     check_clouds(source, target, method)
     warn_of_estimated_parameters(method, source, target, soft=temperature is not None)
+    source, target, matches = with_constants(source), with_constants(target), with_numpy_constants(matches)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)
     inputs = Inputs(source, target, method, robust, temperature=softness)
     return result_of(inputs, _estimate, Matches.given(primal(matches)), primal(init), options)

@@ -26,8 +26,8 @@ from mcgicp_jax._math.poses import adjoint_to_source, translation_adjoint, units
 from mcgicp_jax._math.symmetric_matrices import inverse_3, inverse_6
 from mcgicp_jax._pose_solver.matched import Motion
 
-# Probability with which right tie points, or a right prior, seem to be contradicted.
-_UNLIKELY = 1e-6
+# Probability with which right tie points seem to be contradicted; and rounding of their residuals in steps of float32.
+_UNLIKELY, _ROUNDING = 1e-6, 4
 
 
 class TiePoints(NamedTuple):
@@ -91,7 +91,11 @@ def form_at(
         # Imported late, like all of SciPy but its trees.
         import scipy.special
 
-        most = float(scipy.special.chdtri(3 * len(moved), _UNLIKELY)) if len(moved) else np.inf
+        # Coordinates are rounded to float32, which very precise tie points show.
+        reach = xp.max(xp.abs(moved), initial=0) + xp.max(xp.abs(center))
+        rounding = _ROUNDING * np.finfo(np.float32).eps * reach
+        stiffest = xp.sum(xp.trace(information, axis1=1, axis2=2))
+        most = (scipy.special.chdtri(3 * len(moved), _UNLIKELY) if len(moved) else np.inf) + stiffest * rounding**2
     most = xp.asarray(most, energy.dtype)
     if prior is None:
         return PoseForm(stiffness, force, energy, Prior(rotation, xp.zeros(3), xp.zeros((6, 6))), most)

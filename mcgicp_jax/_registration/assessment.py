@@ -198,6 +198,17 @@ def fields_of_pose(pose: jaxlie.SE3, source_origin: Any, target_origin: Any) -> 
     return {"T_target_source": user, "source_origin": source_origin, "target_origin": target_origin, "centred": pose}
 
 
+def with_traced_pose(
+    result: RegistrationResult, pose: jaxlie.SE3, source_origin: Any, target_origin: Any, inputs: Any
+) -> RegistrationResult:
+    """A result of values, with a centred pose that has a derivative by traced `inputs`."""
+    constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)
+    numbers = {"cost": constant_by(result.cost), "rmse": constant_by(result.rmse)}
+    uncertainty = _later(lambda: result.uncertainty.value, True, constant_by)
+    fields = numbers | fields_of_pose(pose, source_origin, target_origin)
+    return result.build(**vars(result) | fields | {"uncertainty": uncertainty})
+
+
 def _later(compute: Callable[[], Any], concrete: bool, constant_by: Callable[[Any], Any] = lambda value: value) -> Lazy:
     """Deferred where concrete; traced values must be computed before the trace ends."""
 

@@ -40,9 +40,8 @@ Key = TypeVar("Key")
 # Numbers of pairs of a chunk per device: with a sketch on an H200, chunks of 256 pairs took 0.7 (2,000 points) to 0.95
 # (6,000 points) of the time of chunks of 64. Batches of fewer pairs have smaller chunks. Each size compiles.
 _SIZES = (16, 64, 256)
-# Most rows of both clouds of all pairs of a chunk per device: 256 pairs of two clouds of 4,096 rows. And the temporary
-# memory of a row, bytes (MC-GICP with covariances, compiled for an H100), of which a chunk may use half of the memory
-# of the device, or of what is left of it.
+# Most rows of both clouds of all pairs of a chunk per device: 256 pairs of two clouds of 4,096 rows. Temporary memory
+# of a row, bytes (MC-GICP with covariances, compiled for an H100): a chunk may use half of what is free on a device.
 _ROWS, _MEMORY_PER_ROW = 2**21, 1000
 # On a CPU, where pairs that have ended cost as much as others until all have.
 _SIZE_ON_CPU = 4
@@ -171,8 +170,8 @@ class _Group(Generic[Key]):
         if self._mesh.devices[0].platform == "cpu":
             return _SIZE_ON_CPU
         rows = sum(cloud.valid.size for cloud in self.waiting[0][1][2:])
-        memory = self._mesh.devices[0].memory_stats() or {}
-        free = memory.get("bytes_limit", np.inf) - memory.get("bytes_in_use", 0)
+        memories = [device.memory_stats() or {} for device in self._mesh.devices]
+        free = min((memory.get("bytes_limit") or np.inf) - memory.get("bytes_in_use", 0) for memory in memories)
         most = min(_ROWS, 0.5 * free / _MEMORY_PER_ROW)
         return max(size for size in _SIZES if size * rows <= most or size == _SIZES[0])
 

@@ -234,14 +234,15 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         return run
     status = run.loop.state.status
     if status == Status.UNVERIFIED:
-        from_prior, from_ties = squared_residuals(run.loop.state.pose, run.problem.measurements)
+        measurements = run.problem.measurements
+        from_prior, from_ties = squared_residuals(run.loop.state.pose, measurements)
         if from_prior > CONTRADICTION:
             doubt = f"prior: the pose is {np.sqrt(from_prior):.2g} standard deviations away from it, and UNVERIFIED"
-        elif run.problem.measurements is not None and from_ties > run.problem.measurements.form.most:
-            most = run.problem.measurements.form.most
+        elif measurements is not None and from_ties > measurements.form.most:
             doubt = (
                 f"tie_points: their squared residuals add up to {from_ties:.2g} squared standard deviations, those of "
-                f"right ones to at most {most:.2g}, and the pose is UNVERIFIED; some may be wrong, or more uncertain"
+                f"right ones to at most {measurements.form.most:.2g}, and the pose is UNVERIFIED; some may be wrong, "
+                "or more uncertain"
             )
         else:
             doubt = doubt_of_patterns(run.inputs.source)

@@ -143,6 +143,7 @@ def rates() -> None:
         timed("threads")
         workers.shutdown(cancel_futures=True)
         by_default = timed(None)[0]
+        workers.shutdown(cancel_futures=True)
         start = timed(workers)[0] - timed(workers)[0]
         processes()
         turns = []
@@ -168,7 +169,7 @@ def rates() -> None:
         )
         print(f" {start:.1f} s, which pays off from {start / (1 / mine - 1 / in_processes):,.0f} pairs")
         print(
-            f"{'':12} by default, no process started: {count / by_default:.1f}, {count / by_default / rate:.2f} of",
+            f"{'':12} by default, no process waiting: {count / by_default:.1f}, {count / by_default / rate:.2f} of",
             end="",
         )
         print(" small_gicp")
