@@ -84,14 +84,9 @@ def run(
             )
         return pair
 
-    results: Iterator[PairResult]
-    concrete_pairs = map(concrete, pairs)
-    if executor is None and job.uses_chunks:
-        results = map(PairResult.with_warning, job.register_in_chunks(concrete_pairs, num_cores()))
-    else:
-        results = _by_executor(job, concrete_pairs, executor, count)
-    for result in results:
-        yield result.index, result.registration
+    with contextlib.closing(_results(job, map(concrete, pairs), executor, count)) as results:
+        for result in results:
+            yield result.index, result.registration
 
 
 def run_differentiated(
@@ -131,7 +126,7 @@ def run_differentiated(
             yield Pair(pair.index, source, target, *start)
 
     fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
-    for answer in _by_executor(fixed, sent(), executor, count, fixed.run_chunk):
+    for answer in _results(fixed, sent(), executor, count, fixed.run_chunk):
         if isinstance(answer, RanPair):
             runs[answer.index] = answer.run
             continue
@@ -152,15 +147,17 @@ def run_differentiated(
     return [results[index] for index in sorted(results)]
 
 
-def _by_executor(
+def _results(
     job: BatchJob,
     pairs: Iterator[Pair],
     executor: ChosenExecutor,
     count: int | None,
     in_thread: Callable[..., Any] | None = None,
-) -> Iterator[Any]:
-    """The results of pairs; threads of this process get those of a chunk by `in_thread`, whose errors are raised."""
-    if executor is None:
+) -> Generator[Any, None, None]:
+    """The results of pairs. To differentiate them, threads have `in_thread` for a chunk, whose errors are raised."""
+    if executor is None and in_thread is None and job.uses_chunks:
+        yield from map(PairResult.with_warning, job.register_in_chunks(pairs, num_cores()))
+    elif executor is None:
         yield from _by_threads_then_processes(job, pairs, count, in_thread)
     elif executor == "threads":
         yield from _by_threads(job, pairs, in_thread)
