@@ -54,8 +54,8 @@ def preprocess(
             grid of voxels is turned, differently for each cloud, so that planes along the axes are not biased.
             "auto": the smallest size at which at most 5 % of the neighbourhoods are lines, such as scan lines, and at
             most 40,000 voxels remain; a larger one where noise makes neighbourhoods thicker than 0.3 of their width.
-            Where no size has so few lines without that, as with posts and edges, the smallest size with at most 1.5
-            times the fewest lines of any, if these are half of those of the points.
+            Posts and edges are lines at any size. Where they are more than 5 %, or fewer lines would be thicker than
+            that, the smallest size with at most 1.5 times the fewest lines, if lines fall to half.
             Points that are spread evenly are kept as they are, as are clouds of fewer than 500 points or with
             covariances. The repr of the result says what was chosen and why. None keeps every point.
         num_neighbors: number k of neighbours, including the point itself, from which a covariance is computed; at
@@ -113,6 +113,9 @@ def preprocessed_in(
             "or preprocess(cloud, None) for all points"
         )
     cloud = finite_rows(cloud, None if grid is None else grid.measured)
+    if grid is not None and grid.columns.shape[1] != len(cloud):
+        # Rows with a channel that is not finite were left out.
+        grid = None
     preprocessed = with_neighbors(cloud, voxel_size, num_neighbors, search, grid)
     if checked:
         _warn_of_loss(cloud, preprocessed, num_neighbors)
@@ -150,12 +153,9 @@ def with_neighbors(
     grid: Grid | None = None,
 ) -> PointCloud:
     """`preprocess` for a cloud of `finite_rows`, whose grid may be known."""
-    voxels, (own_grid,) = voxels_and_grids(voxel_size, cloud)
+    voxels, (own_grid,) = voxels_and_grids(voxel_size, cloud, measured=True)
     if voxels.size is not None:
-        # A grid lacks the rows that are placeholders only once others are left out. It has too many if rows were left
-        # out for their channels.
-        complete = [numbered for numbered in (grid, own_grid) if numbered and numbered.columns.shape[1] == len(cloud)]
-        cloud = _downsampled(cloud, complete[0] if complete else grid_of(np.asarray(cloud.points)), voxels.size)
+        cloud = _downsampled(cloud, grid or own_grid or grid_of(np.asarray(cloud.points)), voxels.size)
     points, channel_valid, covariances = np.asarray(cloud.points), cloud.channel_valid, cloud.covariances
     dtype = jax.dtypes.canonicalize_dtype(points.dtype)
     # Clouds far from zero are centred, at a float32 origin, which has the same value inside a transformation.

@@ -81,8 +81,11 @@ def voxels_for(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> Voxels:
     return voxels_and_grids(voxel_size, *clouds)[0]
 
 
-def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tuple[Voxels, Sequence[Grid | None]]:
-    """`voxels_for`, and the grids of the clouds from which a size was chosen, with the voxels numbered; else None."""
+def voxels_and_grids(
+    voxel_size: VoxelSize | Voxels, *clouds: PointCloud, measured: bool = False
+) -> tuple[Voxels, Sequence[Grid | None]]:
+    """`voxels_for`, and the grids of the clouds from which a size was chosen, with the voxels numbered; else None.
+    `measured`: the clouds are `finite_rows`, of which a second look would leave out more as far from the others."""
     none = [None] * len(clouds)
     if isinstance(voxel_size, Voxels):
         return voxel_size, none
@@ -97,7 +100,7 @@ def voxels_and_grids(voxel_size: VoxelSize | Voxels, *clouds: PointCloud) -> tup
         # `preprocess` says what is expected.
         return Voxels(), none
     raw = {row: cloud for row, cloud in enumerate(clouds) if cloud.deferred_neighbors is None}
-    points = [_finite_points(cloud) for cloud in raw.values()]
+    points = [(np.asarray(cloud.points), None) if measured else _finite_points(cloud) for cloud in raw.values()]
     counts = [len(finite) for finite, _ in points]
     # Clouds with covariances cannot be averaged.
     if any(cloud.covariances is not None for cloud in raw.values()) or (
