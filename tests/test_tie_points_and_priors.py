@@ -170,7 +170,7 @@ def test_uncertain_or_no_tie_points_hardly_change_the_pose(corner, deviation, co
 
 @pytest.mark.parametrize("wrong", ["none", "one", "all"])
 def test_wrong_tie_points_are_told(corner, wrong):
-    """Of six with deviations of 1 cm, one 0.2 m off, or all of other points."""
+    """Of six with deviations of 1 cm, one 0.2 m off along each axis, or all of other points."""
     source, target, truth = corner
     points, targets, covariances = tie_points(truth, source.points, 0.01)
     if wrong == "one":

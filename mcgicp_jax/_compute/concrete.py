@@ -102,8 +102,8 @@ _zero = jax.jit(lambda: jnp.zeros(()))
 
 
 def with_numpy_constants(tree: Any) -> Any:
-    """The tree with its concrete JAX arrays in NumPy inside a trace, where the result of any operation on them would be
-    a tracer."""
+    """The tree with its concrete JAX arrays, but those of `DeferredRows`, in NumPy inside a trace, where the result of
+    any operation on them would be a tracer."""
     leaves, structure = jax.tree.flatten(tree, is_leaf=has_rows)
     constants = {i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array) and not is_tracer(leaf)}
     if not constants or not is_tracer(_zero()):

@@ -76,7 +76,7 @@ def num_cores() -> int:
     return min(count, _quota(), int(limit) if limit.isdecimal() and int(limit) else count)
 
 
-# Read once, with the affinity and LOKY_MAX_CPU_COUNT of then.
+# Read once. Affinity and LOKY_MAX_CPU_COUNT at that time count, too.
 _quota = functools.cache(loky.cpu_count)
 
 

@@ -120,7 +120,7 @@ def run_differentiated(
             prepared[pair.index] = ready
             values = ready.inputs.values()
             source, target = values[:2]
-            # In this process, what was made of a traced one.
+            # Threads take the prior as it was checked, perhaps as a tracer; workers check its values.
             prior: Any = values.prior if at_home else ready.prior
             start = ready.init, prior, ready.traced, ready.doubt, ready.max_coarse_distance
             yield Pair(pair.index, source, target, *start)
@@ -154,7 +154,8 @@ def _results(
     count: int | None,
     in_thread: Callable[..., Any] | None = None,
 ) -> Generator[Any, None, None]:
-    """The results of pairs. To differentiate them, threads have `in_thread` for a chunk, whose errors are raised."""
+    """The results of pairs. `in_thread`: what threads do with a chunk of pairs that are differentiated; its errors are
+    raised."""
     if executor is None and in_thread is None and job.uses_chunks:
         yield from map(PairResult.with_warning, job.register_in_chunks(pairs, num_cores()))
     elif executor is None:

@@ -129,6 +129,11 @@ class PoseMeasurements(eqx.Module):
         turn = motion.rotation @ self.rotation.T
         return Motion(turn, motion.translation - self.center - turn @ (self.translation - self.center))
 
+    def _now(self, motion: Motion) -> Float[Array, "3 4"]:
+        """[ΔR | Δt] of a pose, Δt in units of the radius."""
+        turn, shift = self._change(motion)
+        return jnp.concatenate([turn, shift[:, None] / self.radius], axis=1)
+
     def prior_residual(self, motion: Motion) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """ξ at a pose, and its derivative by each of six twists, one per row."""
         shift = self._change(motion).translation
@@ -147,15 +152,12 @@ class PoseMeasurements(eqx.Module):
 
     def cost_of_ties(self, motion: Motion) -> Float[Array, ""]:
         """Cost of the tie points at a pose, squared standard deviations."""
-        turn, shift = self._change(motion)
-        change = jnp.concatenate([turn, shift[:, None] / self.radius], axis=1) - jnp.eye(3, 4, dtype=shift.dtype)
-        change, form = change.reshape(12), self.form
+        change, form = (self._now(motion) - jnp.eye(3, 4, dtype=self.center.dtype)).reshape(12), self.form
         return form.energy - 2 * form.force @ change + change @ form.stiffness @ change
 
     def force_and_stiffness(self, motion: Motion) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """γ, and its stiffness JᵀQJ, at a pose."""
-        turn, shift = self._change(motion)
-        now = jnp.concatenate([turn, shift[:, None] / self.radius], axis=1)
+        now = self._now(motion)
         axes = jnp.eye(3, dtype=now.dtype)
         along = jnp.concatenate([jnp.zeros((3, 3, 3), now.dtype), axes[:, :, None]], axis=2)
         about = jnp.cross(axes[:, :, None], now[None], axis=1)

@@ -62,7 +62,7 @@ def find_correspondences(
     traced = not is_concrete(source, target, pose, method, max_distance)
     search = search or default_search(traced)
     check_clouds(source, target, method)
-    source, target = (with_constants(cloud) if traced else cloud for cloud in (source, target))
+    source, target = with_constants(source), with_constants(target)
     method = method.resolve(source, target)
     check_positive("max_distance", max_distance)
     num_candidates = method.num_candidates if num_candidates is None else num_candidates
