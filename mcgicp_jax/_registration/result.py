@@ -109,7 +109,7 @@ class Uncertainty(NamedTuple):
 
 
 class RegistrationResult(eqx.Module):
-    """Result of `register` or `estimate_pose`; a pytree.
+    """Result of `register` or `estimate_pose`; a pytree. Read first: `status`, `matrix`, `deviations`, `overlap`.
 
     All fields are evaluated at the returned pose, with the matches of the last update. They are NumPy scalars and
     arrays; inside `jit`, `vmap` or `grad`, and when returned by these, JAX arrays. Only the pose carries a gradient;
