@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
@@ -45,10 +44,6 @@ def by_position(rows: SearchPoints) -> SearchPoints:
     return SearchPoints(rows.points, rows.descriptors[:, :0], rows.valid)
 
 
-def on_host(rows: SearchPoints) -> SearchPoints:
-    return jax.tree.map(np.asarray, rows)
-
-
 class Correspondences(eqx.Module):
     """For each source point, its match in the target; a pytree.
 
@@ -67,6 +62,10 @@ class Correspondences(eqx.Module):
 
     def __repr__(self) -> str:
         return f"Correspondences({self.indices.shape[-1]} source rows)"
+
+
+# Maps a pose to target rows, as `AbstractIndex.nearest` does.
+Matcher: TypeAlias = Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]
 
 
 class AbstractIndex(abc.ABC):
@@ -89,9 +88,7 @@ class AbstractIndex(abc.ABC):
         """
 
     @abc.abstractmethod
-    def follow(
-        self, source: SearchPoints, max_distance: float, num_candidates: int = 1
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
+    def follow(self, source: SearchPoints, max_distance: float, num_candidates: int = 1) -> Matcher:
         """A function that maps a pose to the rows that `nearest` returns, several candidates in any order.
 
         It serves one registration, and may reuse the results of earlier poses.

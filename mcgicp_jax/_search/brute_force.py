@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -15,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.size_classes import size_class
-from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, SearchPoints, on_host, search_points
+from mcgicp_jax._search.base import IDENTITY, AbstractIndex, AbstractSearch, Matcher, SearchPoints, search_points
 
 # Coordinates and descriptors of rows, each with its penalties.
 Coordinates: TypeAlias = list[tuple[Array, Array | None]]
@@ -69,15 +68,12 @@ class DenseIndex(AbstractIndex):
         pose = jnp.asarray(pose, source.points.dtype)
         return np.asarray(_nearest(pose, _padded(source), self._target, num_candidates))[:, : source.valid.size]
 
-    def follow(
-        self, source: SearchPoints, max_distance: float, num_candidates: int = 1
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
+    def follow(self, source: SearchPoints, max_distance: float, num_candidates: int = 1) -> Matcher:
         return lambda pose: self.nearest(pose, source, max_distance, num_candidates)
 
 
 def _padded(rows: SearchPoints) -> SearchPoints:
     """The rows padded to their size class: clouds of all sizes run few programs."""
-    rows = on_host(rows)
     missing = size_class(rows.valid.size) - rows.valid.size
     return jax.tree.map(lambda array: np.pad(array, [(0, missing)] + [(0, 0)] * (array.ndim - 1)), rows)
 
@@ -105,8 +101,8 @@ def _nearest(
         runs = jnp.sort(_smallest(functools.reduce(jnp.minimum, of_rows), num_candidates), axis=1)
         rows = (runs[:, :, None] * _RUN + jnp.arange(_RUN)).reshape(len(runs), runs.shape[1] * _RUN)
         squares = _squares(_at(queries, np.s_[:, None, None]), _at(targets, runs)).reshape(rows.shape)
-        first = _smallest(squares, num_candidates)
-        square, row = (jnp.take_along_axis(table, first, axis=1) for table in (squares, rows))
+        places = _smallest(squares, num_candidates)
+        square, row = (jnp.take_along_axis(table, places, axis=1) for table in (squares, rows))
         row = jnp.where(jnp.isfinite(square), row, -1).astype(jnp.int32)
         return jnp.pad(row, [(0, 0), (0, num_candidates - row.shape[1])], constant_values=-1).T
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from mcgicp_jax._compute.cache import MAX_ROWS, Cache
 from mcgicp_jax._compute.concrete import DeferredRows
 from mcgicp_jax._compute.programs import call_host
-from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints, on_host, search_points
+from mcgicp_jax._search.base import IDENTITY, AbstractSearch, SearchPoints, search_points
 from mcgicp_jax._search.ties import TiedTree, TreeBackend
 from mcgicp_jax._search.tree_index import LARGEST_UNORDERED, TreeIndex
 
@@ -79,7 +79,7 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
         return None if self.workers == -1 else self.workers
 
     def index(self, target: SearchPoints) -> TreeIndex:
-        return TreeIndex(self, on_host(target))
+        return TreeIndex(self, target)
 
     def nearest_traced(
         self,

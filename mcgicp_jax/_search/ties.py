@@ -74,7 +74,7 @@ class TiedTree:
             ordered = positions[rows]
             rows = np.sort(rows[np.arange(len(rows)) - np.searchsorted(ordered, ordered) < most_equal])
             self._rows, points = np.append(rows, len(points)), points[rows]
-        self._held, self._tree = points, trees.build(points)
+        self._tree_points, self._tree = points, trees.build(points)
 
     def leaf_order(self) -> Int[np.ndarray, "M"]:
         size = len(self.points)
@@ -103,14 +103,14 @@ class TiedTree:
         """
         if self._rows is not None and k >= self._most_equal:
             return TiedTree(self._trees, self.points, k + 1).nearest(queries, k, bound)
-        size = len(self._held)
+        size = len(self._tree_points)
         k = min(k, size)
-        asked = min(k + 1, size)
-        max_asked = min(max(_TIE_CANDIDATES * (k + 1), _MIN_TIE_CANDIDATES), size)
-        distances, rows = self.query(queries, asked, bound)
+        num_candidates = min(k + 1, size)
+        max_candidates = min(max(_TIE_CANDIDATES * (k + 1), _MIN_TIE_CANDIDATES), size)
+        distances, rows = self.query(queries, num_candidates, bound)
         nearest = rows[:, :k].astype(np.int32)
         farthest = distances[:, k - 1]
-        slack = slack_of(farthest, np.minimum(distances[:, asked - 1], bound))
+        slack = slack_of(farthest, np.minimum(distances[:, num_candidates - 1], bound))
         equal = distances[:, 1:] == distances[:, :-1]
         # Usually none are equal, and one check of all takes a tenth of the time of one per query.
         tied = np.flatnonzero(equal.any(axis=1) & np.isfinite(distances[:, 0])) if equal.any() else np.arange(0)
@@ -120,24 +120,24 @@ class TiedTree:
             nearest[tied] = np.take_along_axis(rows, order, axis=1)[:, :k]
             # A tie that includes the last candidate may extend beyond it.
             tied = tied[np.isfinite(distances[:, -1]) & (distances[:, k - 1] == distances[:, -1])]
-            if asked == max_asked:
+            if num_candidates == max_candidates:
                 break
-            asked = min(2 * asked, max_asked)
+            num_candidates = min(2 * num_candidates, max_candidates)
             if tied.size:
-                distances, rows = self.query(queries[tied], asked, bound)
-        if tied.size and asked < size:
+                distances, rows = self.query(queries[tied], num_candidates, bound)
+        if tied.size and num_candidates < size:
             # Brute force, for queries with long ties. Such queries mostly coincide, too.
-            distinct, first, whose = np.unique(queries[tied], axis=0, return_index=True, return_inverse=True)
+            distinct, first, number = np.unique(queries[tied], axis=0, return_index=True, return_inverse=True)
             in_all = np.empty((len(distinct), k), np.int32)
             for i, (query, limit) in enumerate(zip(distinct, farthest[tied][first], strict=True)):
                 squares = np.zeros(size)
                 # In float64, as trees compute.
-                for column, value in zip(self._held.T.astype(np.float64), query, strict=True):
+                for column, value in zip(self._tree_points.T.astype(np.float64), query, strict=True):
                     squares += (column - value) ** 2
                 # A part in a billion covers rounding.
                 near = np.flatnonzero(squares <= limit**2 * (1 + 1e-9))
                 in_all[i] = near[np.lexsort((near, squares[near]))[:k]]
-            nearest[tied] = in_all[whose.ravel()]
+            nearest[tied] = in_all[number.ravel()]
         return nearest if self._rows is None else self._rows[nearest].astype(np.int32), slack
 
 

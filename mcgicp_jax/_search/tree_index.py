@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
+import jax
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 from mcgicp_jax._compute.cache import Cache
 from mcgicp_jax._math.poses import rotated, rotation_from_quaternion
-from mcgicp_jax._search.base import AbstractIndex, SearchPoints, on_host
+from mcgicp_jax._search.base import AbstractIndex, Matcher, SearchPoints
 from mcgicp_jax._search.ties import TiedTree, TreeBackend, slack_of
 
 # Number of sets of missing channels of queries whose trees, of all target rows each, are kept: two cameras, each of
@@ -26,6 +26,7 @@ class TreeIndex(AbstractIndex):
     """An index over the finite rows: one tree, or where rows lack channels, one per set of channels in common."""
 
     def __init__(self, trees: TreeBackend, target: SearchPoints):
+        target = jax.tree.map(np.asarray, target)
         points = np.hstack([target.points, target.descriptors])
         # Trees reject non-finite points; the sums at the pose lead to the status NON_FINITE.
         self._rows = np.flatnonzero(target.valid & np.isfinite(points).all(axis=1)).astype(np.int32)
@@ -44,25 +45,21 @@ class TreeIndex(AbstractIndex):
     def nearest(
         self, pose: Float[ArrayLike, "7"], source: SearchPoints, max_distance: float, num_candidates: int = 1
     ) -> Int[np.ndarray, "m N"]:
-        source = on_host(source)
+        source = jax.tree.map(np.asarray, source)
         queries = np.hstack([_moved(pose, np.asarray(source.points, np.float64)), source.descriptors])
         queries[~source.valid] = np.nan
         return self.nearest_of(queries, source.penalty, max_distance, num_candidates)[0].T
 
-    def follow(
-        self, source: SearchPoints, max_distance: float, num_candidates: int = 1
-    ) -> Callable[[Float[ArrayLike, "7"]], Int[np.ndarray, "m N"]]:
-        return _MatchTracker(self, self._trees, on_host(source), max_distance, num_candidates).nearest
+    def follow(self, source: SearchPoints, max_distance: float, num_candidates: int = 1) -> Matcher:
+        source = jax.tree.map(np.asarray, source)
+        return _MatchTracker(self, self._trees, source, max_distance, num_candidates).nearest
 
     def nearest_of(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"] | None, max_distance: float, k: int
     ) -> tuple[Int[np.ndarray, "N k"], Float[np.ndarray, "N"]]:
-        """The k nearest target rows of each query, −1 for none; and the slack: the distance, metres, that a query may
-        move before these rows can change, but for their order.
-
-        Queries are positions and descriptors, metres, with a `penalty` as in `SearchPoints`; those that are not finite
-        have no neighbours.
-        """
+        """The k nearest target rows of each query (position and descriptors, metres), −1 for none; and the slack: the
+        distance, metres, that a query may move before these rows can change, but for their order. Queries that are not
+        finite have no neighbours."""
         indices, slack = np.full((len(queries), k), -1, np.int32), np.zeros(len(queries))
         if not self._rows.size:
             return indices, slack
@@ -79,28 +76,19 @@ class TreeIndex(AbstractIndex):
             patterns, which = _patterns(penalty[active])
         groups = [active] if len(patterns) == 1 else [rows[which == i] for i in range(len(patterns))]
         for group, pattern in zip(groups, patterns, strict=True):
-            nearest, slack[group] = self._nearest(queries[group], pattern, k, bound)
+            trees, of_group = self._parts.get(pattern.tobytes(), partial(self._built, pattern)), queries[group]
+            if len(trees) == 1:
+                nearest, slack[group] = trees[0].nearest(of_group, k, bound)
+            else:
+                # One more of each tree: the slack depends on the next nearest row.
+                parts = zip(*(tree.nearest_and_squares(of_group, k + 1, bound) for tree in trees), strict=True)
+                candidates, squares = map(np.hstack, parts)
+                order = np.lexsort((candidates, squares), axis=1)[:, : k + 1]
+                nearest, squares = (np.take_along_axis(table, order, axis=1) for table in (candidates, squares))
+                nearest = nearest[:, :k]
+                slack[group] = slack_of(*np.sqrt(squares[:, [min(k, squares.shape[1]) - 1, -1]]).T)
             indices[group, : nearest.shape[1]] = nearest
         return indices, slack
-
-    def _nearest(
-        self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "C"], k: int, bound: float
-    ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
-        """`nearest_of` for queries that lack the same channels."""
-        trees = self._parts.get(penalty.tobytes(), partial(self._built, penalty))
-        if len(trees) == 1:
-            numbers, slack = trees[0].nearest(queries, k, bound)
-            return trees[0].rows[numbers], slack
-        candidates, distances = [], []
-        for tree in trees:
-            # The slack depends on the next nearest row.
-            numbers, _ = tree.nearest(queries, k + 1, bound)
-            candidates.append(tree.rows[numbers])
-            distances.append(tree.squares(queries, numbers))
-        rows, squares = np.hstack(candidates), np.hstack(distances)
-        order = np.lexsort((rows, squares), axis=1)[:, : k + 1]
-        rows, squares = np.take_along_axis(rows, order, axis=1), np.take_along_axis(squares, order, axis=1)
-        return rows[:, :k], slack_of(*np.sqrt(squares[:, [min(k, squares.shape[1]) - 1, -1]]).T)
 
     def _built(self, penalty: Float[np.ndarray, "C"]) -> list[_TreeForChannels]:
         """The trees for queries of one penalty: one for each set of channels in common."""
@@ -125,7 +113,7 @@ class _TreeForChannels:
     ):
         common = np.concatenate([np.ones(3, bool), penalty == 0])
         # Maps tree indices to cloud rows; the last entry is −1 (no neighbour).
-        self.rows = np.append(rows, np.int32(-1))
+        self._rows = np.append(rows, np.int32(-1))
         self._columns = slice(None) if common.all() else np.flatnonzero(common)
         self._penalty = penalty.sum()
         self._tree = TiedTree(trees, points[:, self._columns])
@@ -133,15 +121,18 @@ class _TreeForChannels:
     def nearest(
         self, queries: Float[np.ndarray, "N D"], k: int, bound: float
     ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N"]]:
-        """Tree indices of the k nearest (fewer if the tree has fewer), and the slack."""
-        return self._tree.nearest(queries[:, self._columns], k, bound)
+        """Cloud rows of the k nearest (fewer if the tree has fewer), −1 for none; and the slack."""
+        numbers, slack = self._tree.nearest(queries[:, self._columns], k, bound)
+        return self._rows[numbers], slack
 
-    def squares(self, queries: Float[np.ndarray, "N D"], numbers: Int[np.ndarray, "N m"]) -> Float[np.ndarray, "N m"]:
-        """Squared search distances to tree indices, including the penalties for missing channels; metres²."""
-        points = self._tree.points
-        difference = queries[:, None, self._columns] - points[np.minimum(numbers, len(points) - 1)]
+    def nearest_and_squares(
+        self, queries: Float[np.ndarray, "N D"], k: int, bound: float
+    ) -> tuple[Int[np.ndarray, "N m"], Float[np.ndarray, "N m"]]:
+        """Cloud rows, and the squared search distances with the penalties for missing channels, metres²."""
+        rows, points = self._tree.nearest(queries[:, self._columns], k, bound)[0], self._tree.points
+        difference = queries[:, None, self._columns] - points[np.minimum(rows, len(points) - 1)]
         squares = np.sum(difference * difference, axis=2) + self._penalty
-        return np.where(numbers < len(points), squares, np.inf)
+        return self._rows[rows], np.where(rows < len(points), squares, np.inf)
 
 
 class _MatchTracker:
@@ -162,13 +153,13 @@ class _MatchTracker:
         self._queries = np.concatenate([self._points, source.descriptors[order]], axis=1)
         self._penalty = None if source.penalty is None else source.penalty[order]
         # Position of each point at its last search, and the distance that it may move from there.
-        self._asked: Float[np.ndarray, "n 3"] = np.full((order.size, 3), np.nan)
+        self._searched: Float[np.ndarray, "n 3"] = np.full((order.size, 3), np.nan)
         self._slack: Float[np.ndarray, "n"] = np.zeros(order.size)
         self._rows: Int[np.ndarray, "k N"] = np.full((k, source.valid.size), -1, np.int32)
 
     def nearest(self, pose: Float[ArrayLike, "7"]) -> Int[np.ndarray, "k N"]:
         moved = _moved(pose, self._points)
-        shift = moved - self._asked
+        shift = moved - self._searched
         # Comparisons with NaN, which marks points not yet searched for, are false.
         unchanged = np.einsum("ij,ij->i", shift, shift) < self._slack**2
         stale = np.flatnonzero(~unchanged)
@@ -178,7 +169,7 @@ class _MatchTracker:
         rows, self._slack[stale] = self._index.nearest_of(
             self._queries.take(stale, axis=0), penalty, self._max_distance, len(self._rows)
         )
-        self._asked = np.where(unchanged[:, None], self._asked, moved)
+        self._searched = np.where(unchanged[:, None], self._searched, moved)
         # Arrays returned earlier must not change.
         self._rows = self._rows.copy()
         self._rows[:, self._order[stale]] = rows.T
