@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, offsets_of, weighted_covariance
 from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods
@@ -26,43 +26,34 @@ def channel_kernel(around: Neighborhoods, covariance: Float[Array, "..."]) -> Fl
     count, correlated = around.num_channels, covariance.ndim == 2
     differences = [around.difference(channel) for channel in range(count)]
     matrix = covariance if correlated else jnp.diag(jnp.broadcast_to(covariance, (count,)))
-    if around.near_measured is None:
-        return jnp.exp(-0.5 * _marginal_square(differences, None, matrix, correlated))
-    common = list(around.near_measured)
-    differences = [jnp.where(both, difference, 0) for difference, both in zip(differences, common, strict=True)]
-    kernel = jnp.exp(-0.5 * _marginal_square(differences, common, matrix, correlated))
-    for i, both in enumerate(common):
+    common = None if around.near_measured is None else list(around.near_measured)
+    if common is not None:
+        differences = [jnp.where(both, difference, 0) for difference, both in zip(differences, common, strict=True)]
+    if not correlated:
+        squares = [difference * difference / matrix[i, i] for i, difference in enumerate(differences)]
+    else:
+        # The Cholesky recurrence, unrolled over the channels, so that LAPACK is not called. For the marginal of Λ, the
+        # rows of channels that are not common are replaced by those of the identity.
+        root: list[list[Array]] = []
+        solution: list[Array] = []
+        for i, difference in enumerate(differences):
+            row: list[Array] = []
+            for j in range(i):
+                entry = matrix[i, j] if common is None else jnp.where(common[i] & common[j], matrix[i, j], 0)
+                row.append((entry - sum(a * b for a, b in zip(row, root[j], strict=False))) / root[j][j])
+            variance = matrix[i, i] if common is None else jnp.where(common[i], matrix[i, i], 1)
+            pivot = jnp.sqrt(variance - sum(a * a for a in row))
+            solution.append((difference - sum(a * y for a, y in zip(row, solution, strict=True))) / pivot)
+            root.append([*row, pivot])
+        squares = [y * y for y in solution]
+    kernel = jnp.exp(-0.5 * sum(squares[1:], start=squares[0]))
+    for i, both in enumerate(common or []):
         others = both & around.other
         number = jnp.sum(others, axis=0)
         similarity = jnp.exp(-0.5 * differences[i] ** 2 / matrix[i, i])
         mean = jnp.sum(jnp.where(others, similarity, 0), axis=0) / jnp.maximum(number, 1)
         kernel = kernel * jnp.where(both, 1, jnp.where(number > 0, mean, 1))
     return kernel
-
-
-def _marginal_square(
-    differences: list[Float[Array, "k N"]],
-    common: list[Bool[Array, "k N"]] | None,
-    covariance: Float[Array, "C C"],
-    correlated: bool,
-) -> Float[Array, "k N"]:
-    """Δᵀ Λ⁻¹ Δ over the common channels: for the others, Λ is replaced by the identity and Δ must be 0."""
-    if not correlated:
-        squares = [difference * difference / covariance[i, i] for i, difference in enumerate(differences)]
-        return sum(squares[1:], start=squares[0])
-    # The Cholesky recurrence, unrolled over the channels, so that LAPACK is not called.
-    root: list[list[Array]] = []
-    solution: list[Array] = []
-    for i, difference in enumerate(differences):
-        row: list[Array] = []
-        for j in range(i):
-            entry = covariance[i, j] if common is None else jnp.where(common[i] & common[j], covariance[i, j], 0)
-            row.append((entry - sum(a * b for a, b in zip(row, root[j], strict=False))) / root[j][j])
-        variance = covariance[i, i] if common is None else jnp.where(common[i], covariance[i, i], 1)
-        pivot = jnp.sqrt(variance - sum(a * a for a in row))
-        solution.append((difference - sum(a * y for a, y in zip(row, solution, strict=True))) / pivot)
-        root.append([*row, pivot])
-    return sum((y * y for y in solution[1:]), start=solution[0] * solution[0])
 
 
 def plane_covariance(local: LocalGeometry, epsilon: Float[Array, ""]) -> Float[Array, "6 N"]:
