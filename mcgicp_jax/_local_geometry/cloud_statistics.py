@@ -188,17 +188,11 @@ def changes_of_exposure(
 def _ranges(cloud: PointCloud) -> list[tuple[float, float]]:
     """The 5 and 95 % quantiles of a sample of each channel; NaN if no point has the channel."""
     rows, valid = sampled_rows(np.asarray(cloud.valid))
-    rows = rows[valid]
     # In float32, differences of quantiles may overflow.
-    channels = np.asarray(cloud.channels, np.float64)[rows]
-    measured = np.isfinite(channels)
-    if cloud.channel_valid is not None:
-        measured &= np.asarray(cloud.channel_valid)[rows]
-    ranges = []
-    for column, present in zip(channels.T, measured.T, strict=True):
-        low, high = np.quantile(column[present], [_QUANTILES[0], _QUANTILES[-1]]) if present.any() else (np.nan, np.nan)
-        ranges.append((float(low), float(high)))
-    return ranges
+    channels = _channel_values(cloud)[rows].astype(np.float64)
+    channels[~(valid[:, None] & np.isfinite(channels))] = np.nan
+    quantiles = of_known(partial(np.nanquantile, q=[_QUANTILES[0], _QUANTILES[-1]], axis=0), channels)
+    return list(zip(*quantiles.tolist(), strict=True))
 
 
 def with_channels_matched(

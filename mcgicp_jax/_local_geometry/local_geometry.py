@@ -128,13 +128,13 @@ def geometry_of_cells(local: LocalGeometry, covariances: Float[Array, "6 n"], nu
     covariances = jax.lax.stop_gradient(covariances)
     normal = alg.smallest_eigenvector(covariances)
     across = alg.inner(normal, alg.multiply(covariances, normal))
+    area = num_candidates * _SQUARE_EDGE * (covariances[0] + covariances[3] + covariances[5])
     return LocalGeometry(
         covariance=covariances.T,
         normal=normal.T,
         observability=geometry_observability(covariances, normal, jnp.full_like(across, _CELL_POINTS)).T,
         roughness=across,
-        neighborhood_radius=0.5
-        * jnp.sqrt(num_candidates * _SQUARE_EDGE * (covariances[0] + covariances[3] + covariances[5])),
+        neighborhood_radius=0.5 * jnp.sqrt(area),
         fits=local.fits,
     )
 
@@ -147,17 +147,14 @@ def local_geometries(
     num_threads: int | None = 1,
 ) -> tuple[LocalGeometry, LocalGeometry]:
     """Local geometry of rows (None: all) of two preprocessed clouds; on the host by `num_threads` (None: no limit)."""
+    sides = list(zip((source, target), rows, strict=True))
     if is_concrete(source, target):
-        calls = [
-            partial(geometry_table(target, with_channels).trees, rows[1], num_threads),
-            partial(geometry_table(source, with_channels).trees, rows[0], num_threads),
-        ]
+        calls = [partial(geometry_table(cloud, with_channels).trees, part, num_threads) for cloud, part in sides[::-1]]
         of_target, of_source = side_by_side(calls, num_threads)
-        return joined(*of_source), joined(*of_target)
-    # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
-    source_inputs = nb.of_rows(nb.with_near(source, with_channels), rows[0])
-    target_inputs = nb.of_rows(nb.with_near(target, with_channels), rows[1])
-    of_source, of_target = over_both(_geometry, None, source_inputs, target_inputs)
+    else:
+        # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
+        inputs = [nb.of_rows(nb.with_near(cloud, with_channels), part) for cloud, part in sides]
+        of_source, of_target = over_both(_geometry, None, *inputs)
     return joined(*of_source), joined(*of_target)
 
 

@@ -156,27 +156,25 @@ def _missing(cloud: PointCloud, part: Bool[AnyArray, "N C"]) -> PointCloud:
 def explained(cloud: PointCloud) -> Explained:
     # Huge values overflow; comparisons with shares that are not finite are False.
     with np.errstate(all="ignore"):
-        sample = _sample(constant(cloud))
+        cloud = constant(cloud)
+        xp = numpy_for(cloud)
+        rows, present = sampled_rows(xp.asarray(cloud.valid))
+        # Every second row, then the others.
+        order = np.argsort(np.arange(rows.size) % 2, stable=True)
+        rows, present = rows[order], present[order]
+        dtype = np.float64 if xp is np else cloud.points.dtype
+        points, channels = (xp.asarray(array)[rows].astype(dtype).T for array in (cloud.points, cloud.channels))
+        present = present & xp.isfinite(points).all(axis=0)
+        weights = present[None].astype(dtype)
+        if cloud.channel_valid is not None:
+            weights = weights * xp.asarray(cloud.channel_valid)[rows].T
+        counts = xp.maximum(weights.sum(axis=1, keepdims=True), 1)
+        channels = xp.where(weights > 0, channels, 0)
+        channels = weights * (channels - channels.sum(axis=1, keepdims=True) / counts)
+        deviations = xp.sqrt((channels**2).sum(axis=1, keepdims=True) / counts)
+        channels = channels / xp.where(deviations > 0, deviations, 1)
+        sample = _Sample(xp.where(present, points, 0), present, channels, weights)
         return Explained(_by_angles(sample), _smooth(sample))
-
-
-def _sample(cloud: PointCloud) -> _Sample:
-    xp = numpy_for(cloud)
-    rows, present = sampled_rows(xp.asarray(cloud.valid))
-    # Every second row, then the others.
-    order = np.argsort(np.arange(rows.size) % 2, stable=True)
-    rows, present = rows[order], present[order]
-    dtype = np.float64 if xp is np else cloud.points.dtype
-    points, channels = (xp.asarray(array)[rows].astype(dtype).T for array in (cloud.points, cloud.channels))
-    present = present & xp.isfinite(points).all(axis=0)
-    weights = present[None].astype(dtype)
-    if cloud.channel_valid is not None:
-        weights = weights * xp.asarray(cloud.channel_valid)[rows].T
-    counts = xp.maximum(weights.sum(axis=1, keepdims=True), 1)
-    channels = xp.where(weights > 0, channels, 0)
-    channels = weights * (channels - channels.sum(axis=1, keepdims=True) / counts)
-    deviations = xp.sqrt((channels**2).sum(axis=1, keepdims=True) / counts)
-    return _Sample(xp.where(present, points, 0), present, channels / xp.where(deviations > 0, deviations, 1), weights)
 
 
 def _share(sample: _Sample, predicted: Float[AnyArray, "C n"]) -> Float[AnyArray, "C"]:
@@ -190,7 +188,7 @@ def _by_angles(sample: _Sample) -> Float[AnyArray, "C"]:
     xp = numpy_for(sample)
     x, y, z = sample.points
     distance = xp.sqrt(x * x + y * y + z * z)
-    half = (np.arange(x.size) >= _first_half(x.size)).astype(int)
+    half = (np.arange(x.size) >= (x.size + 1) // 2).astype(int)
     count = sample.present.sum()
     num_bins = xp.clip(count // _PER_BIN, 1, _BINS)
     rows = xp.concatenate([sample.channels, xp.broadcast_to(sample.weights, sample.channels.shape)])
@@ -231,8 +229,8 @@ def _smooth(sample: _Sample) -> Float[AnyArray, "C"]:
     basis = xp.stack(list(products.values()))
     sizes = xp.sqrt((basis * basis).mean(axis=1, keepdims=True))
     basis = basis / xp.where(sizes > 0, sizes, 1)
-    middle = [_first_half(basis.shape[1])]
-    halves = [xp.split(array, middle, axis=1) for array in (basis, sample.weights, sample.channels)]
+    middle = (square.size + 1) // 2
+    halves = [xp.split(array, [middle], axis=1) for array in (basis, sample.weights, sample.channels)]
     # The normal equations of each half, for each channel.
     equations = [
         (xp.stack([(row * part) @ part.T for row in weights]), values @ part.T)
@@ -245,7 +243,3 @@ def _smooth(sample: _Sample) -> Float[AnyArray, "C"]:
     second, first = alg.solve(matrix, side)
     predicted = xp.concatenate([first @ halves[0][0], second @ halves[0][1]], axis=1)
     return _share(sample, xp.clip(predicted, -_LARGEST, _LARGEST))
-
-
-def _first_half(num_rows: int) -> int:
-    return (num_rows + 1) // 2
