@@ -137,10 +137,9 @@ def matrix_of(pose: Pose) -> Any:
 
 def matrices_of(parameters: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 4 4"]:
     """Inverse of `parameters_of`."""
-    matrices = np.zeros((*parameters.shape[:-1], 4, 4))
+    matrices = np.tile(np.eye(4), (*parameters.shape[:-1], 1, 1))
     matrices[..., :3, :3] = rotation_from_quaternion(parameters[..., :4])
     matrices[..., :3, 3] = parameters[..., 4:]
-    matrices[..., 3, 3] = 1
     return matrices
 
 
@@ -211,14 +210,12 @@ def move_pose(pose: jaxlie.SE3, twist: Float[Array, "6"], center: Float[Array, "
 
 def adjoint_to_center(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
     """Matrix from ξ of T exp(ξ), in the source's frame, to twists about the centre in the target's frame."""
-    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
-    return to_center.adjoint().astype(pose.wxyz_xyz.dtype)
+    return (jaxlie.SE3.from_translation(-center) @ pose).adjoint().astype(pose.wxyz_xyz.dtype)
 
 
 def adjoint_to_source(pose: jaxlie.SE3, center: Float[Array, "3"]) -> Float[Array, "6 6"]:
     """Inverse of `adjoint_to_center`."""
-    to_center = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.identity(), -center) @ pose
-    return to_center.inverse().adjoint().astype(pose.wxyz_xyz.dtype)
+    return (jaxlie.SE3.from_translation(-center) @ pose).inverse().adjoint().astype(pose.wxyz_xyz.dtype)
 
 
 def units(radius: Float[AnyScalar, ""]) -> Float[AnyArray, "6"]:
@@ -249,8 +246,7 @@ def adjoint(matrices: Float[AnyArray, "*batch 4 4"]) -> Float[AnyArray, "*batch 
     rotations = matrices[..., :3, :3]
     # The columns of t × R.
     crossed = xp.swapaxes(xp.cross(matrices[..., None, :3, 3], xp.swapaxes(rotations, -1, -2)), -1, -2)
-    below = xp.concatenate([xp.zeros_like(rotations), rotations], axis=-1)
-    return xp.concatenate([xp.concatenate([rotations, crossed], axis=-1), below], axis=-2)
+    return xp.block([[rotations, crossed], [xp.zeros_like(rotations), rotations]])
 
 
 def translation_adjoint(offset: Float[AnyArray, "3"]) -> Float[AnyArray, "6 6"]:
@@ -262,8 +258,7 @@ def skew(vectors: Float[AnyArray, "*batch 3"]) -> Float[AnyArray, "*batch 3 3"]:
     xp = numpy_for(vectors)
     x, y, z = xp.moveaxis(vectors, -1, 0)
     zero = xp.zeros_like(x)
-    entries = xp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    return entries.reshape(*vectors.shape, 3)
+    return xp.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vectors.shape, 3)
 
 
 # ζ(2k) for k = 1 to 28: the generating function of the Bernoulli numbers, which inverts the derivative of exp, is a
@@ -279,10 +274,9 @@ def exponential(twists: Float[np.ndarray, "*batch 6"]) -> Float[np.ndarray, "*ba
     sine, half = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
     # (θ − sin θ)/θ³; its rounding, ε/θ², is multiplied by θ².
     third = np.where(angle > 0, (1 - sine) / np.where(angle > 0, angle, 1) ** 2, 0)
-    matrices = np.zeros((*twists.shape[:-1], 4, 4))
+    matrices = np.tile(np.eye(4), (*twists.shape[:-1], 1, 1))
     matrices[..., :3, :3] = np.eye(3) + sine * omega + half * square
     matrices[..., :3, 3] = ((np.eye(3) + half * omega + third * square) @ twists[..., :3, None])[..., 0]
-    matrices[..., 3, 3] = 1
     return matrices
 
 
