@@ -31,13 +31,14 @@ residuals, as constants to autodiff,
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
 from mcgicp_jax._local_geometry.cloud_statistics import gain_and_offset
@@ -217,17 +218,13 @@ class Photometric(AbstractAdaptiveTerm):
 
     def sample(self, matches: PosedMatches) -> Residuals:
         values, slopes, fitted, products = self._residuals(matches)
-        rows = [jnp.stack(columns, axis=1) for columns in (values, fitted, products)]
-        moved = jnp.where(matches.valid, matches.moved, 0).T
-        return Residuals(rows[0], jnp.stack(slopes).transpose(2, 0, 1), rows[1], rows[2], moved)
+        moved, rows = jnp.where(matches.valid, matches.moved, 0).T, partial(jnp.stack, axis=1)
+        return Residuals(rows(values), jnp.stack(slopes).transpose(2, 0, 1), rows(fitted), rows(products), moved)
 
     def adapt(self, sample: Residuals, fraction: Float[AnyScalar, ""]) -> Photometric:
         xp = numpy_for(self, sample, fraction)
         # NumPy takes two thirds of the time for contiguous columns.
-        values, fitted, products, moved = (
-            xp.asarray(rows).T.copy() for rows in (sample.values, sample.fitted, sample.products, sample.moved)
-        )
-        slopes = xp.asarray(sample.slopes).transpose(1, 2, 0).copy()
+        values, slopes, fitted, products, moved = (xp.moveaxis(xp.asarray(rows), 0, -1).copy() for rows in sample)
         gains, offsets = self.gains, self.offsets
         if self.equalizes_channels:
             predicted = values[1:] + gains[:, None] * fitted + offsets[:, None]
@@ -248,17 +245,24 @@ class Photometric(AbstractAdaptiveTerm):
         weights = 1 / (1 + scaled**2 / _KERNEL_SCALE**2)
         scores = (weights * scaled / scale)[:, None] * slopes
         expected = xp.sum(weights * lengths / scale**2, axis=1)
+        # f. Cells are counted without the NaNs of padding, which thus does not change which cells collide; a sample of
+        # a part of the points always has the same number of rows.
         size = xp.where(self.spacing > 0, _CELL * self.spacing, 1)
-        # Without the NaNs of padding, which thus does not change which cells collide; a sample of a part of the points
-        # always has the same number of rows.
         num_points = xp.maximum(xp.sum(~xp.isnan(moved[0])), 1)
         num_cells = xp.where(fraction < 1, moved.shape[1], num_points).astype(np.int32)
         cells = cell_numbers(tuple(xp.nan_to_num(xp.floor(moved / size)).astype(np.int32)), num_cells)
-        correlated = _squared_sums(scores, cells)
+        # |u|² of each residual, summed over the cells.
+        columns = scores.reshape(-1, cells.size)
+        if numpy_for(scores, cells) is np:
+            sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
+        else:
+            sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
+        correlated = (sums**2).sum(axis=0).reshape(scores.shape[:2]).sum(axis=1)
         independent = xp.sum((scores**2).sum(axis=1), axis=1)
         expected = xp.where(expected > 0, expected, 1)
         # In a sample, a cell holds fewer pairs of correlated residuals, by the factor `fraction`.
         designs = xp.maximum((independent + (correlated - independent) / fraction) / expected, 1)
+        # q.
         agreeing = xp.sum(weights[1:] * xp.where(measured[1:], products, 0), axis=1)
         assumed = xp.sum(weights[1:] * lengths[1:], axis=1)
         reliability = xp.clip(agreeing / xp.where(assumed > 0, assumed, 1), _LEAST_RELIABILITY, 1)
@@ -298,12 +302,3 @@ class Photometric(AbstractAdaptiveTerm):
         response = change / xp.where(predicted > 0, predicted, 1)
         response = xp.where(predicted > 0, xp.clip(response, _LEAST_RESPONSE, 1), 1)
         return replace(self, designs=self.designs / response.astype(self.designs.dtype))
-
-
-def _squared_sums(scores: Float[AnyArray, "K 3 n"], cells: Int[AnyArray, "n"]) -> Float[AnyArray, "K"]:
-    columns = scores.reshape(-1, scores.shape[-1])
-    if numpy_for(scores, cells) is np:
-        sums: Any = np.stack([np.bincount(cells, column) for column in columns], axis=1)
-    else:
-        sums = jnp.zeros_like(columns.T).at[cells].add(columns.T)
-    return (sums**2).sum(axis=0).reshape(scores.shape[:2]).sum(axis=1)
