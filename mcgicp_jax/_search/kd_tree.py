@@ -92,9 +92,7 @@ class AbstractTreeSearch(AbstractSearch, TreeBackend):
     ) -> Int[Array, "m N"]:
         shape = (num_candidates, source.valid.shape[0])
 
-        def nearest(
-            pose: Any, source: SearchPoints, target: SearchPoints, max_distance: Any, running: Any
-        ) -> Int[np.ndarray, "m N"]:
+        def nearest(pose: Any, source: Any, target: Any, max_distance: Any, running: Any) -> Int[np.ndarray, "m N"]:
             if not running:
                 return np.full(shape, -1, np.int32)
             arrays = jax.tree.leaves(target)

@@ -33,7 +33,7 @@ class TreeIndex(AbstractIndex):
         self._points = points[self._rows]
         penalty = np.zeros_like(target.descriptors) if target.penalty is None else target.penalty
         self._patterns, self._which = _patterns(penalty[self._rows])
-        self._trees = trees
+        self.trees = trees
         # Lists of trees by the penalties of the queries. Threads that need the same ones at once may each build them.
         self._parts = Cache(_MAX_SETS)
 
@@ -51,8 +51,7 @@ class TreeIndex(AbstractIndex):
         return self.nearest_of(queries, source.penalty, max_distance, num_candidates)[0].T
 
     def follow(self, source: SearchPoints, max_distance: float, num_candidates: int = 1) -> Matcher:
-        source = jax.tree.map(np.asarray, source)
-        return _MatchTracker(self, self._trees, source, max_distance, num_candidates).nearest
+        return _MatchTracker(self, jax.tree.map(np.asarray, source), max_distance, num_candidates).nearest
 
     def nearest_of(
         self, queries: Float[np.ndarray, "N D"], penalty: Float[np.ndarray, "N C"] | None, max_distance: float, k: int
@@ -96,7 +95,7 @@ class TreeIndex(AbstractIndex):
         which = numbers[self._which]
         groups = [slice(None) if len(common) == 1 else which == i for i in range(len(common))]
         return [
-            _TreeForChannels(self._trees, self._points[group], self._rows[group], pattern)
+            _TreeForChannels(self.trees, self._points[group], self._rows[group], pattern)
             for group, pattern in zip(groups, common, strict=True)
         ]
 
@@ -139,14 +138,13 @@ class _MatchTracker:
     """The k nearest target rows of one source, pose after pose. They are provably the same while a point has moved by
     less than its slack since its last search; after the first poses this holds for most points."""
 
-    def __init__(self, index: TreeIndex, trees: TreeBackend, source: SearchPoints, max_distance: float, k: int):
-        self._index = index
-        self._max_distance = max_distance
+    def __init__(self, index: TreeIndex, source: SearchPoints, max_distance: float, k: int):
+        self._index, self._max_distance = index, max_distance
         # Valid source rows, for large clouds sorted by neighbourhood. All arrays below are in this order.
         order: Int[np.ndarray, "n"] = np.flatnonzero(source.valid)
         if order.size > LARGEST_UNORDERED:
             points = np.nan_to_num(source.points[order], posinf=0, neginf=0)
-            order = order[TiedTree(trees, points).leaf_order()]
+            order = order[TiedTree(index.trees, points).leaf_order()]
         self._order = order
         self._points = np.asarray(source.points[order], np.float64)
         # Positions at the current pose, and descriptors.
