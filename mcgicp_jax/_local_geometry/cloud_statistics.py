@@ -57,12 +57,11 @@ def channel_noise(
     samples = [_noise_rows(cloud) for cloud in (source, target)]
     local_geometries = constant(geometries((samples[0][0], samples[1][0])))
     xp = numpy_for(source, target, local_geometries)
-    residuals, values, sampled, across, ratios = [], [], [], [], []
-    for cloud, local, (rows, counts) in zip((source, target), local_geometries, samples, strict=True):
-        deviations = xp.sqrt(local.fits.residual.T)
-        residuals.append(xp.where(counts[:-1], deviations, xp.nan))
-        values.append(_channel_values(cloud))
-        sampled.append(xp.where(counts[:-1].T, values[-1][rows], xp.nan))
+    values = [_channel_values(cloud) for cloud in (source, target)]
+    residuals, sampled, across, ratios = [], [], [], []
+    for channels, local, (rows, counts) in zip(values, local_geometries, samples, strict=True):
+        residuals.append(xp.where(counts[:-1], xp.sqrt(local.fits.residual.T), xp.nan))
+        sampled.append(xp.where(counts[:-1].T, channels[rows], xp.nan))
         xx, xy, xz, yy, yz, zz = local.covariance.T
         x, y, z = local.normal.T
         with np.errstate(over="ignore", invalid="ignore"):
