@@ -245,8 +245,8 @@ class Photometric(AbstractAdaptiveTerm):
         weights = 1 / (1 + scaled**2 / _KERNEL_SCALE**2)
         scores = (weights * scaled / scale)[:, None] * slopes
         expected = xp.sum(weights * lengths / scale**2, axis=1)
-        # f. Cells are counted without the NaNs of padding, which thus does not change which cells collide; a sample of
-        # a part of the points always has the same number of rows.
+        # The design effects f. Cells are counted without the NaNs of padding, which thus does not change which cells
+        # collide; a sample of a part of the points always has the same number of rows.
         size = xp.where(self.spacing > 0, _CELL * self.spacing, 1)
         num_points = xp.maximum(xp.sum(~xp.isnan(moved[0])), 1)
         num_cells = xp.where(fraction < 1, moved.shape[1], num_points).astype(np.int32)
@@ -262,7 +262,7 @@ class Photometric(AbstractAdaptiveTerm):
         expected = xp.where(expected > 0, expected, 1)
         # In a sample, a cell holds fewer pairs of correlated residuals, by the factor `fraction`.
         designs = xp.maximum((independent + (correlated - independent) / fraction) / expected, 1)
-        # q.
+        # The reliabilities q.
         agreeing = xp.sum(weights[1:] * xp.where(measured[1:], products, 0), axis=1)
         assumed = xp.sum(weights[1:] * lengths[1:], axis=1)
         reliability = xp.clip(agreeing / xp.where(assumed > 0, assumed, 1), _LEAST_RELIABILITY, 1)
