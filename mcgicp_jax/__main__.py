@@ -16,9 +16,9 @@ import tyro
 
 from mcgicp_jax import __version__
 from mcgicp_jax._cli.batch import batch
-from mcgicp_jax._cli.flags import with_flags
 from mcgicp_jax._cli.multiway import multiway
 from mcgicp_jax._cli.odometry import odometry
+from mcgicp_jax._cli.options import with_flags
 from mcgicp_jax._cli.register import compare, demo, register
 from mcgicp_jax._compute.messages import reason_of
 from mcgicp_jax._compute.programs import LOGGER

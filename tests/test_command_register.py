@@ -13,7 +13,7 @@ import scipy.spatial
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics, plot
-from mcgicp_jax._cli.flags import with_flags
+from mcgicp_jax._cli.options import with_flags
 from mcgicp_jax.extend import COLOR_SPACES, DATASETS, FORMATS, KERNELS, METHODS
 from tests.scenes import motion, room_corner
 

@@ -27,8 +27,7 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._cli.choices import Choices, listed, with_channels
-from mcgicp_jax._cli.flags import with_flags
-from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_names
+from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_flags, with_names
 from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax._pose_solver.degeneracy import as_text
@@ -37,8 +36,6 @@ from mcgicp_jax.io.files import replacing
 Row: TypeAlias = dict[str, str]
 # Source, target and initial pose, as in the first columns of the table.
 Key: TypeAlias = tuple[str, str, str]
-# Initial poses of pairs.
-Starts: TypeAlias = dict[Key, Float[np.ndarray, "4 4"] | None]
 # Number and result of each pair, as it is completed.
 Completed: TypeAlias = Generator[tuple[int, mcg.RegistrationResult], None, None]
 
@@ -92,14 +89,17 @@ def batch(
     wanted = _pairs_in(pairs, glob)
     rows = {(row["source"], row["target"], row["init"]): row for row in _read_rows(output)}
     rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
-    register = _registration(pairs if pairs.is_dir() else pairs.parent, wanted, method, shared)
+    folder = pairs if pairs.is_dir() else pairs.parent
+    read, arguments = _reader_and_arguments(folder, wanted, method, shared)
     executor = None if workers == "auto" else Processes(workers)
-
     missing = {key: init for key, init in wanted.items() if key not in rows}
+    sources, targets = ([partial(read, folder / key[side]) for key in missing] for side in (0, 1))
+    arguments |= {"init": list(missing.values()), "executor": executor}
+    register = partial(mcg.register_as_completed, sources, targets, **arguments)
+
     finished = len(wanted) - len(missing)
     resumed = f", of which {finished:,} are in {output} and are kept, whatever the options were" if finished else ""
     print(f"pairs:     {len(wanted):,}{resumed}")
-    register = partial(register, missing, executor)
     interrupted = bool(missing) and _register_missing(list(missing), register, output, rows, finished)
     rows = {key: rows[key] for key in wanted if key in rows} | rows
     _write_rows(output, rows.values())
@@ -115,7 +115,8 @@ def batch(
     return 1 if failed else 0
 
 
-def _pairs_in(path: Path, glob: str) -> Starts:
+def _pairs_in(path: Path, glob: str) -> dict[Key, Float[np.ndarray, "4 4"] | None]:
+    """The pairs and their initial poses."""
     if path.is_dir():
         names = [cloud.name for cloud in clouds_in(path, glob).paths]
         return {(source, target, ""): None for target, source in itertools.pairwise(names)}
@@ -156,8 +157,10 @@ def _pairs_in(path: Path, glob: str) -> Starts:
     return dict(pairs)
 
 
-def _registration(folder: Path, pairs: Iterable[Key], method: Method, options: Options) -> Callable[..., Completed]:
-    """A function that registers pairs by an executor, with defaults from the first pair that can be read."""
+def _reader_and_arguments(
+    folder: Path, pairs: Iterable[Key], method: Method, options: Options
+) -> tuple[Callable[[Path], mcg.PointCloud], dict[str, Any]]:
+    """Function that reads a cloud, and arguments of `register_as_completed`, from the first pair that can be read."""
     errors: list[Exception] = []
     for *names, _ in pairs:
         try:
@@ -175,17 +178,10 @@ def _registration(folder: Path, pairs: Iterable[Key], method: Method, options: O
     def preprocessed() -> tuple[mcg.PointCloud, mcg.PointCloud]:
         return choices.preprocess(names[0], source), choices.preprocess(names[1], target)
 
-    resolved_method, arguments = choices.method(name, preprocessed), choices.arguments(name, preprocessed)
+    arguments = {"method": choices.method(name, preprocessed), **choices.arguments(name, preprocessed)}
     choices.print_method(name, arguments.get("max_distance", ()))
     arguments |= {"voxel_size": size, "num_neighbors": options.num_neighbors}
-    read = partial(_read, choices.channels, options.columns)
-
-    def register(starts: Starts, executor: Processes | None) -> Completed:
-        sources, targets = ([partial(read, folder / key[side]) for key in starts] for side in (0, 1))
-        inits = list(starts.values())
-        return mcg.register_as_completed(sources, targets, resolved_method, init=inits, executor=executor, **arguments)
-
-    return register
+    return partial(_read, choices.channels, options.columns), arguments
 
 
 def _read(channels: Sequence[str], columns: int | None, path: Path) -> mcg.PointCloud:

@@ -52,14 +52,13 @@ def multiway(
     names = [path.name for path in paths]
     choices = Choices(shared, names, raw)
     clouds = [choices.preprocess(name, cloud) for name, cloud in zip(names, raw, strict=True)]
-    voxels = choices.voxels
-    print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({voxels})")
+    print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({choices.voxels})")
     name = choices.method_name(method)
-    initial_poses = None if init is None else list(io.read_poses(init))
     arguments = choices.arguments(name, lambda: (clouds[1], clouds[0]))
+    arguments |= {"init": None if init is None else list(io.read_poses(init))}
     resolved_method = choices.method(name, lambda: (clouds[1], clouds[0]))
     choices.print_method(name, arguments.get("max_distance", ()))
-    result = mcg.multiway(clouds, resolved_method, init=initial_poses, voxel_size=voxels.size, **arguments)
+    result = mcg.multiway(clouds, resolved_method, voxel_size=choices.voxels.size, **arguments)
 
     edges, rejected = result.graph.edges, int((~np.asarray(result.graph.kept)).sum())
     print(f"pairs:     {len(result.registrations)} registered, {len(edges)} with a result, {rejected} of them rejected")
@@ -67,8 +66,9 @@ def multiway(
     print(f"chi²:      {fit if np.isfinite(result.graph.chi_squared) else 'unknown, since no number is redundant'}")
     deviations = np.sqrt(np.diagonal(np.asarray(result.graph.covariance), 0, 1, 2))
     millimetres, degrees = 1e3 * deviations[:, :3].max(), np.degrees(deviations[:, 3:].max())
-    known = np.isfinite(millimetres) and np.isfinite(degrees)
-    uncertainty = f"at most {millimetres:.1f} mm and {degrees:.3f} deg uncertain" if known else "some of them unknown"
+    uncertainty = "some of them unknown"
+    if np.isfinite(millimetres) and np.isfinite(degrees):
+        uncertainty = f"at most {millimetres:.1f} mm and {degrees:.3f} deg uncertain"
     print(f"poses:     {result.graph.status.name}, {uncertainty}")
 
     if output is not None:
@@ -92,8 +92,8 @@ def multiway(
         if status == mcg.Status.CONVERGED:
             continue
         why = f"{status.name}, its pose contradicts the others or is not known"
-        found = {registration.status.name for pair, registration in result.registrations.items() if i in pair}
-        if status == mcg.Status.TOO_FEW_CORRESPONDENCES and found:
-            why = f"no registration holds its pose ({', '.join(sorted(found))})"
+        statuses = {registration.status.name for pair, registration in result.registrations.items() if i in pair}
+        if status == mcg.Status.TOO_FEW_CORRESPONDENCES and statuses:
+            why = f"no registration holds its pose ({', '.join(sorted(statuses))})"
         print(f"mcgicp: {path}: {why}", file=sys.stderr)
     return 0 if result.converged else 1

@@ -1,4 +1,4 @@
-"""Options that the commands share, and checks of files."""
+"""Options that the commands share, checks of files, and messages in the words of the command line."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import errno
 import inspect
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from fnmatch import fnmatch
@@ -71,6 +72,10 @@ _BINARY = {suffix for suffix, cloud_format in FORMATS.items() if cloud_format.re
 _MOST_NAMES = 5
 # Parameters of methods for which there is an option.
 PARAMETERS = ("channel_covariance", "channel_weights", "epsilon")
+# Values of arguments in messages.
+_VALUE = r'\([\d., ]+\)|"\w+"|[\d.]*\d|True|N'
+# Not within paths, also those of files such as max_distance=(1, 0.2).npz.
+_ARGUMENT = re.compile(rf"(?<![\w./-])([a-z_]+)(?:=({_VALUE})(?!:))?(?![\w/=-]|\.\w)")
 
 
 def enumerated(names: Sequence[str], last: str = "and") -> str:
@@ -241,3 +246,22 @@ def clouds_in(folder: Path, glob: str = "*", map: File = None, columns: int | No
         more = f" and {len(names) - _MOST_NAMES:,} more" if len(names) > _MOST_NAMES else ""
         print(f"left out:  {', '.join(names[:_MOST_NAMES])}{more} (not clouds)")
     return files
+
+
+def with_flags(message: str, args: Sequence[str] = ()) -> str:
+    """The message with arguments of Python, such as max_distance=(1, 0.2), as options of the command line; also the
+    name with which it begins, if that is an option among `args`."""
+    name, *rest = message.split(": ", maxsplit=1)
+    option = f"--{name.replace('_', '-')}"
+    if any(argument.split("=")[0] == option for argument in args):
+        message = ": ".join([option, *rest])
+
+    def flag(match: re.Match[str]) -> str:
+        name, value = match.groups("")
+        # Some names are words, too.
+        if name not in {*PairOptions.__dataclass_fields__, "recover"} or not (value or "_" in name):
+            return match[0]
+        value = re.sub(r'[(),"]|True', "", value)
+        return f"--{name.replace('_', '-')} {value}".rstrip()
+
+    return _ARGUMENT.sub(flag, message)

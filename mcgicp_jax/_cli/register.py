@@ -15,9 +15,8 @@ from jaxtyping import Float
 
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
+from mcgicp_jax._cli import options as cli
 from mcgicp_jax._cli.choices import Choices, with_channels
-from mcgicp_jax._cli.flags import with_flags
-from mcgicp_jax._cli.options import PARAMETERS, File, Method, PairOptions, check_outputs, enumerated, with_names
 from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
@@ -45,7 +44,7 @@ _DEMO = ("point-to-plane", "gicp", "color-icp", "mc-gicp")
 class PreparedPair:
     """Two preprocessed clouds with the channels that they have in common."""
 
-    def __init__(self, source: Path, target: Path, options: PairOptions):
+    def __init__(self, source: Path, target: Path, options: cli.PairOptions):
         # Raise for unknown formats and missing files before any work is done.
         for path in (source, target):
             format_of(path)
@@ -57,8 +56,8 @@ class PreparedPair:
         self.raw = read(source), read(target)
         names = str(source), str(target)
         self.choices = Choices(options, names, self.raw)
-        preprocess = self.choices.preprocess
-        self.preprocessed = preprocess(names[0], self.raw[0]), preprocess(names[1], self.raw[1])
+        source_cloud, target_cloud = map(self.choices.preprocess, names, self.raw)
+        self.preprocessed = source_cloud, target_cloud
         in_source, in_target = (f"{len(self.preprocessed[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
         print(f"points:    source {in_source}, target {in_target} ({self.choices.voxels})")
 
@@ -117,14 +116,14 @@ class PreparedPair:
             print(f"picture:   {self.options.plot}")
 
 
-@with_names
+@cli.with_names
 def register(
     source: Source,
     target: Target,
-    shared: PairOptions,
-    method: Method = None,
-    output: File = None,
-    aligned: File = None,
+    shared: cli.PairOptions,
+    method: cli.Method = None,
+    output: cli.File = None,
+    aligned: cli.File = None,
 ) -> int:
     """Estimate the pose T_target_source that moves SOURCE onto TARGET.
 
@@ -139,13 +138,13 @@ def register(
         aligned: File for the whole source cloud moved by the pose, such as out.ply.
     """
     shared.check(method)
-    check_outputs(output, cloud=aligned, picture=shared.plot, inputs=(source, target))
+    cli.check_outputs(output, cloud=aligned, picture=shared.plot, inputs=(source, target))
     pair = PreparedPair(source, target, shared)
     name = pair.choices.method_name(method)
     pair.find_start()
     resolved_method = pair.method(name)
     print(f"method:    {name}", end="")
-    for parameter in PARAMETERS:
+    for parameter in cli.PARAMETERS:
         if hasattr(resolved_method, parameter):
             values = np.atleast_1d(getattr(resolved_method, parameter))
             print(f", {parameter} {' '.join(f'{value:.3g}' for value in values)}", end="")
@@ -155,7 +154,6 @@ def register(
     else:
         pair.print_distances()
     result = pair.register(name, resolved_method)
-
     plural = "" if result.num_iterations == 1 else "s"
     print(f"status:    {result.status.name} after {result.num_iterations} iteration{plural}")
     rmse = f", rmse {result.rmse:.4g} m" if result.num_inliers else ""
@@ -182,7 +180,7 @@ def register(
     return _verdict({name: result})
 
 
-def compare(source: Source, target: Target, shared: PairOptions, truth: File = None) -> int:
+def compare(source: Source, target: Target, shared: cli.PairOptions, truth: cli.File = None) -> int:
     """Register SOURCE to TARGET with every method and print a table.
 
     Methods that use channels are skipped if the clouds have none in common. The exit code is 0 only if all methods that
@@ -212,23 +210,23 @@ def demo(output: Path = Path("mcgicp_demo"), *, all_methods: bool = False) -> in
     io.write(source_file, source.cloud)
     io.write(target_file, target.cloud)
     io.write_poses(truth_file, [np.linalg.inv(frames.path(0)) @ frames.path(1)])
-    options = PairOptions(plot=output / "before_after.png")
+    options = cli.PairOptions(plot=output / "before_after.png")
     names = tuple(METHODS) if all_methods else _DEMO
     _compare(source_file, target_file, options, truth_file, names)
+    channel_methods = cli.enumerated([name for name in names if METHODS[name].kind.uses_channels])
     print(
         "Geometry does not constrain motion along a flat wall: methods that use it alone report it (DEGENERATE) and"
         "\nkeep the initial pose along it, so in their rows of the picture the posters do not fit."
-        f"\n{enumerated([name for name in names if METHODS[name].kind.uses_channels])} are constrained by the channels "
-        "red, green and blue."
+        f"\n{channel_methods} are constrained by the channels red, green and blue."
         f"\nThe clouds are in {output}; try: mcgicp register {source_file} {target_file}"
     )
     return 0
 
 
 def _compare(
-    source: Path, target: Path, options: PairOptions, truth: Path | None, names: Sequence[str] = tuple(METHODS)
+    source: Path, target: Path, options: cli.PairOptions, truth: Path | None, names: Sequence[str] = tuple(METHODS)
 ) -> dict[str, mcg.RegistrationResult]:
-    check_outputs(picture=options.plot)
+    cli.check_outputs(picture=options.plot)
     true_pose = None if truth is None else _read_pose("truth", truth)
     pair = PreparedPair(source, target, options)
     pair.print_distances()
@@ -289,7 +287,7 @@ def _verdict(results: dict[str, mcg.RegistrationResult]) -> int:
         if not result.converged:
             failed.setdefault(result.status, []).append(name)
     for status, names in failed.items():
-        print(f"mcgicp: {', '.join(names)}: {status.name}: {with_flags(status.advice)}", file=sys.stderr)
+        print(f"mcgicp: {', '.join(names)}: {status.name}: {cli.with_flags(status.advice)}", file=sys.stderr)
     return 1 if failed else 0
 
 

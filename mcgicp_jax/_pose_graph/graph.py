@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
+from scipy.sparse import bsr_array, coo_array
 
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._math.poses import Pose, pose_matrices
@@ -95,7 +96,6 @@ class PoseGraph(eqx.Module):
 
 
 def _initial_poses(edges: Edge) -> Float[np.ndarray, "n 4 4"]:
-    from scipy.sparse import coo_array
     from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
     if not is_concrete(edges) or not len(edges):
@@ -138,7 +138,6 @@ def _chordal_relaxation(
     ends: Int[np.ndarray, "m 2"], motions: Float[np.ndarray, "m 4 4"], roots: Float[np.ndarray, "m 2"], n: int
 ) -> Float[np.ndarray, "n 4 4"]:
     """`roots`: square roots of the information in translation and in rotation."""
-    from scipy.sparse import bsr_array
 
     def least_squares(blocks: Float[np.ndarray, "m 2 b b"], right: np.ndarray, world: np.ndarray) -> np.ndarray:
         """The solution of a sparse system with two blocks in each row, for the last pose `world`."""

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
+from scipy.sparse import bsr_array, coo_array, csc_array, eye_array
 
 from mcgicp_jax._math.poses import exponential
 from mcgicp_jax._pose_graph.edge import WORLD, Factors, motion_jacobians
@@ -57,8 +58,6 @@ class NormalEquations:
     """
 
     def __init__(self, factors: Factors, poses: Poses, in_use: Mask):
-        # Imported late, as SciPy's sparse matrices take a tenth of the import time of the package.
-        from scipy.sparse import coo_array, eye_array
         from scipy.sparse.csgraph import connected_components
 
         self.factors, self.initial_poses, self.in_use, num_poses = factors, poses, in_use, len(poses)
@@ -123,8 +122,6 @@ class NormalEquations:
 
     def matrix(self, blocks: Float[np.ndarray, "m 2 2 6 6"], weights: Shaped[np.ndarray, "m"]) -> Any:
         """The sparse symmetric sum of the weighted blocks of all measurements; with JᵀΛJ, it is H."""
-        from scipy.sparse import bsr_array, csc_array
-
         if not self.size:
             return csc_array((0, 0))
         weighted = weights[:, None, None, None, None] * blocks

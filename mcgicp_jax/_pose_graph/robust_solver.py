@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import coo_array
 
 from mcgicp_jax._compute.concrete import AnyArray
 from mcgicp_jax._math.poses import inverse, matrices_of, parameters_of
@@ -258,7 +259,6 @@ def _wrongly_rejected(state: lm.GraphState, thresholds: lm.PerMeasurement) -> lm
 
 def _is_disputed(state: lm.GraphState, anchors: Edge, uncertain: lm.Mask) -> bool:
     """Whether uncertain edges, of which too many are rejected, join two parts of a graph that nothing else joins."""
-    from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     if state.weights.all():

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import coo_array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
@@ -149,7 +150,6 @@ class Trajectory:
 
     def _close_loop(self, last: int) -> None:
         """Register the last frame to a near one if the motion between them is uncertain, and correct the poses."""
-        from scipy.sparse import coo_array
         from scipy.sparse.csgraph import dijkstra
 
         edges = self._variances[self._accepted], self._ends[:, self._accepted]

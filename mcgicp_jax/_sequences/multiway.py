@@ -9,6 +9,7 @@ from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 from jaxtyping import Float
+from scipy.sparse import coo_array, csr_array
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, check_several
 from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
@@ -207,7 +208,6 @@ def _chained(
 
 def _solved(poses: _Poses, registrations: _Registrations) -> tuple[PoseGraphResult, tuple[Status, ...]]:
     """The poses from all edges, and the status of each cloud. Edges are rejected unless they alone connect clouds."""
-    from scipy.sparse import coo_array
     from scipy.sparse.csgraph import minimum_spanning_tree
 
     measured = [edge_from(i, j, result, uncertain=True) for (i, j), result in registrations.items()]
@@ -233,8 +233,6 @@ def _solved(poses: _Poses, registrations: _Registrations) -> tuple[PoseGraphResu
 
 def _overlapping(clouds: list[PointCloud], poses: _Poses, cell: float) -> list[tuple[int, int]]:
     """Each cloud with the previous one, and with that of largest overlap in each range of gaps 2-3, 4-7, 8-15, …"""
-    from scipy.sparse import csr_array
-
     # Unique cells of each cloud in the world's frame, and the numbers of cells that two clouds have in common.
     moved = [rotated(cloud.coordinates, T[:3, :3]) + T[:3, 3] for cloud, T in zip(clouds, poses, strict=True)]
     keys = [np.unique(wrapped_keys(points, cell)) for points in moved]

@@ -1,4 +1,4 @@
-"""Arrays without named columns of their own: KITTI scans, .npy and .npz."""
+"""Arrays without named columns of their own: .bin files of float32 values, such as KITTI scans, .npy and .npz."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from numpy.lib import format as npy
 
 from mcgicp_jax._clouds.columns import COLORS, INTENSITIES
 from mcgicp_jax._clouds.point_cloud import PointCloud
-from mcgicp_jax.io.bin_layouts import columns_of_floats
 from mcgicp_jax.io.files import check_size, cloud_of
 
 # Metres: float32 resolves 8 mm at this distance; larger coordinates are not written, nor accepted as a KITTI scan.
@@ -20,6 +19,19 @@ _KITTI_LIMIT = 1e5
 # Bound on the compression ratio of deflate.
 DEFLATE_RATIO = 1032
 _RGB_ARRAYS = ("rgb", "color", "colors", "colour", "colours")
+
+# Bound of the whole numbers of rings; the densest LiDARs have 128, and some count from 1.
+_MOST_RINGS = 256
+# Numbers of columns whose repetition is compared. A file is not of four columns if it repeats with another period that
+# is no multiple, so that values that far apart differ by less than this fraction of what those four apart do. (Of
+# periods that are not those of the file, 1.5 and more: KITTI, streets and rooms in scan order and shuffled.)
+_PERIODS, _REPEATS = (3, 5, 6, 7, 9, 10), 0.5
+# Values that are compared.
+_SAMPLE = 120_000
+# Numbers of columns that a refusal suggests where they fill the file.
+_SIZES = range(3, 11)
+# Padding of PCL's points is 0, or the bits of small integers, such as a ring, as float32.
+_PADDING = 1e-30
 
 
 def read_kitti(file: BinaryIO, size: int, columns: int | None = None) -> PointCloud:
@@ -29,10 +41,58 @@ def read_kitti(file: BinaryIO, size: int, columns: int | None = None) -> PointCl
     # The format has no signature. Text is recognised by its bytes, most other files by implausibly large coordinates.
     if data.isascii() and b"\0" not in data:
         raise ValueError("it does not hold float32 coordinates in metres")
-    cloud = cloud_of(columns_of_floats(np.frombuffer(data, "<f4").astype(np.float32), columns))
+    cloud = cloud_of(_columns_of_floats(np.frombuffer(data, "<f4").astype(np.float32), columns))
     if _beyond_kitti(np.asarray(cloud.points)):
         raise ValueError("it does not hold float32 coordinates in metres")
     return cloud
+
+
+def _columns_of_floats(values: Float[np.ndarray, "n"], width: int | None) -> dict[str, Float[np.ndarray, "N"]]:
+    """x, y, z and perhaps intensity, by the layout whose columns fit: KITTI (x, y, z, intensity), nuScenes (ring last),
+    ring and time last, PCL's points of 32 bytes (x, y, z, padding, intensity, padding), or x, y, z. Of rows of a given
+    `width`, the first are x, y, z, and the fourth is the intensity unless it has negative values. Raises
+    `ValueError` if none fits."""
+
+    def split(size: int) -> Any:
+        return values.reshape(-1, size).T if values.size % size == 0 else None
+
+    def named(columns: Any) -> dict[str, Float[np.ndarray, "N"]]:
+        return dict(zip(("x", "y", "z", "intensity"), columns, strict=False))
+
+    columns = split(8) if width in (None, 8) else None
+    if columns is not None and (columns[3] == columns[3][:1]).all() and (np.abs(columns[5:]) < _PADDING).all():
+        return named([*columns[:3], columns[4]])
+    if width is not None:
+        columns = split(width)
+        if columns is None:
+            raise ValueError(f"expected rows of {width} float32 values, got {4 * values.size} bytes")
+        has_intensity = width > 3 and not (columns[3] < 0).any()
+        return named(columns if has_intensity else columns[:3])
+    for size in (6, 5):
+        columns = split(size)
+        if columns is not None and not (columns[3] < 0).any():
+            ring = columns[4]
+            is_number = (ring == np.rint(ring)) & (ring >= 0) & (ring < _MOST_RINGS)
+            if is_number.all() and (ring != ring[:1]).any():
+                return named(columns)
+    # Median difference of values that are so many columns apart.
+    sample, steps = values[:_SAMPLE], {}
+    for size in (4, *_PERIODS):
+        differences = np.abs(sample[size:] - sample[:-size])
+        finite = differences[np.isfinite(differences)]
+        steps[size] = float(np.median(finite)) if finite.size else np.inf
+    columns = split(4)
+    if columns is not None and not (columns[3] < 0).any() and min(steps.values()) >= _REPEATS * steps[4]:
+        return named(columns)
+    columns = split(3)
+    if columns is not None and steps[3] < _REPEATS * min(steps[size] for size in (4, 5, 7, 10)):
+        return named(columns)
+    fitting = [str(size) for size in _SIZES if values.size % size == 0]
+    advice = f"if they begin with x, y, z, say how many there are, columns=N; {', '.join(fitting)} fit"
+    raise ValueError(
+        "its columns are neither those of KITTI (x, y, z, intensity) nor of another known layout; "
+        + (advice if fitting else f"no number of {_SIZES[0]} to {_SIZES[-1]} fills {4 * values.size} bytes")
+    )
 
 
 def read_nuscenes(file: BinaryIO, size: int) -> PointCloud:

@@ -1,4 +1,4 @@
-"""Shared by readers and writers: optional packages, columns, checks, reasons of errors, files that replace others."""
+"""Shared by readers and writers: columns, checks, reasons of errors, files that replace others."""
 
 from __future__ import annotations
 

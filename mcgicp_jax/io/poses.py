@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from mcgicp_jax._math.poses import matrices_of, parameters_of, pose_matrices, pose_matrix
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
@@ -59,8 +60,6 @@ def are_poses(lines: list[str]) -> bool:
 
 
 def _poses_of(rows: Float[np.ndarray, "R C"]) -> Float[np.ndarray, "N 4 4"]:
-    from scipy.spatial.transform import Rotation
-
     if rows.shape == (4, 4):
         return rows[None]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -90,8 +89,6 @@ def write_poses(
         OSError: if the file cannot be written.
         ValueError: if a pose is no rigid motion, or there are not as many timestamps as poses.
     """
-    from scipy.spatial.transform import Rotation
-
     matrices = np.array([pose_matrix(pose, f"poses[{i}]") for i, pose in enumerate(poses)]).reshape(-1, 4, 4)
     rows = matrices[:, :3].reshape(-1, 12)
     if timestamps is not None:
