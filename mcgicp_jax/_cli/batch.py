@@ -26,8 +26,7 @@ from tqdm import tqdm
 
 import mcgicp_jax as mcg
 from mcgicp_jax import io
-from mcgicp_jax._cli.choices import Choices, listed, with_channels
-from mcgicp_jax._cli.options import Method, Options, check_outputs, clouds_in, with_flags, with_names
+from mcgicp_jax._cli import options as cli
 from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax._pose_solver.degeneracy import as_text
@@ -51,15 +50,15 @@ _INTERRUPTED = 130
 _TRIED_AGAIN = (mcg.Status.INVALID_INPUT.name, mcg.Status.WORKER_FAILED.name)
 
 
-@with_names
+@cli.with_names
 def batch(
     pairs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PAIRS")],
     output: Path,
-    method: Method = None,
+    method: cli.Method = None,
     glob: str = "*",
     workers: int | Literal["auto"] = "auto",
     *,
-    shared: Options,
+    shared: cli.Options,
 ) -> int:
     """Register many pairs of clouds and write a table of their poses T_target_source.
 
@@ -85,7 +84,7 @@ def batch(
         check_integer("workers", workers, 1)
     if output.suffix.lower() != ".csv":
         raise ValueError(f"output: expected a .csv file, got {output}")
-    check_outputs(output)
+    cli.check_outputs(output)
     wanted = _pairs_in(pairs, glob)
     rows = {(row["source"], row["target"], row["init"]): row for row in _read_rows(output)}
     rows = {key: row for key, row in rows.items() if key not in wanted or row["status"] not in _TRIED_AGAIN}
@@ -118,7 +117,7 @@ def batch(
 def _pairs_in(path: Path, glob: str) -> dict[Key, Float[np.ndarray, "4 4"] | None]:
     """The pairs and their initial poses."""
     if path.is_dir():
-        names = [cloud.name for cloud in clouds_in(path, glob).paths]
+        names = [cloud.name for cloud in cli.clouds_in(path, glob).paths]
         return {(source, target, ""): None for target, source in itertools.pairwise(names)}
     # Spreadsheets write a byte order mark, people a blank after the comma.
     with open(path, newline="", encoding="utf-8-sig") as file:
@@ -131,7 +130,7 @@ def _pairs_in(path: Path, glob: str) -> dict[Key, Float[np.ndarray, "4 4"] | Non
     if not any(map(str.strip, lines)):
         raise ValueError(f"{path}: the file is empty")
     if not {"source", "target"} <= set(columns):
-        raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
+        raise ValueError(f"{path}: expected the columns source and target, got {cli.listed(columns)}")
     missing = [name for name in _POSE if name not in columns]
     # Or else a misspelt column would leave out all initial poses.
     if missing and any(re.fullmatch(r"m\d\d", name.lower()) for name in columns):
@@ -158,7 +157,7 @@ def _pairs_in(path: Path, glob: str) -> dict[Key, Float[np.ndarray, "4 4"] | Non
 
 
 def _reader_and_arguments(
-    folder: Path, pairs: Iterable[Key], method: Method, options: Options
+    folder: Path, pairs: Iterable[Key], method: cli.Method, options: cli.Options
 ) -> tuple[Callable[[Path], mcg.PointCloud], dict[str, Any]]:
     """Function that reads a cloud, and arguments of `register_as_completed`, from the first pair that can be read."""
     errors: list[Exception] = []
@@ -170,7 +169,7 @@ def _reader_and_arguments(
             errors.append(error)
     else:
         raise ValueError(f"0 of {len(errors):,} pairs can be read; the first error: {errors[0]}")
-    choices = Choices(options, names, (source, target))
+    choices = cli.Choices(options, names, (source, target))
     name = choices.method_name(method)
     size = None if options.voxel_size == "off" else options.voxel_size
     print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
@@ -186,7 +185,7 @@ def _reader_and_arguments(
 
 def _read(channels: Sequence[str], columns: int | None, path: Path) -> mcg.PointCloud:
     try:
-        return with_channels(io.read(path, columns=columns), channels)
+        return cli.with_channels(io.read(path, columns=columns), channels)
     except ValueError as error:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
 
@@ -227,10 +226,10 @@ def _register_missing(
                         raise KeyboardInterrupt
         except KeyboardInterrupt:
             interrupted = True
-    done = [rows[key]["status"] for key in keys if key in rows]
-    registered = sum(status not in _TRIED_AGAIN for status in done)
+    statuses = [rows[key]["status"] for key in keys if key in rows]
+    registered = sum(status not in _TRIED_AGAIN for status in statuses)
     rate = f", {registered / (time.perf_counter() - begin):.3g} pairs per second" if registered else ""
-    print(f"done:      {len(done):,} of {len(keys):,}{rate}")
+    print(f"done:      {len(statuses):,} of {len(keys):,}{rate}")
     return interrupted
 
 
@@ -265,7 +264,9 @@ def _read_rows(path: Path) -> list[Row]:
         raise ValueError(f"{path}: expected a table of mcgicp batch, got the columns {reader.fieldnames}")
     rows = list(reader)
     if unknown := {row["status"] for row in rows} - set(mcg.Status.__members__):
-        raise ValueError(f"{path}: expected statuses of mcgicp batch, such as CONVERGED, got {listed(sorted(unknown))}")
+        raise ValueError(
+            f"{path}: expected statuses of mcgicp batch, such as CONVERGED, got {cli.listed(sorted(unknown))}"
+        )
     return rows
 
 
@@ -283,6 +284,6 @@ def _row(key: Key, result: mcg.RegistrationResult, reason: str) -> Row:
     values = (np.asarray(number).item() for number in (*quality, *result.matrix[:3].ravel(), *result.deviations))
     if not reason and result.status is mcg.Status.DEGENERATE:
         reason = f"unconstrained: {as_text(result.unconstrained_directions)}"
-    reason = with_flags(" ".join((reason or result.status.advice).split()))
+    reason = cli.with_flags(" ".join((reason or result.status.advice).split()))
     texts = (*key, result.status.name, *map(repr, values), reason)
     return dict(zip(_COLUMNS, texts, strict=True))

@@ -12,22 +12,21 @@ import tyro
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax import plot as plots
-from mcgicp_jax._cli.choices import Choices
-from mcgicp_jax._cli.options import File, Method, Options, check_outputs, clouds_in, with_names
+from mcgicp_jax._cli import options as cli
 
 
-@with_names
+@cli.with_names
 def multiway(
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")],
     *,
-    shared: Options,
-    method: Method = None,
+    shared: cli.Options,
+    method: cli.Method = None,
     glob: str = "*",
-    init: File = None,
-    output: File = None,
-    map: File = None,
-    graph: File = None,
-    plot: File = None,
+    init: cli.File = None,
+    output: cli.File = None,
+    map: cli.File = None,
+    graph: cli.File = None,
+    plot: cli.File = None,
 ) -> int:
     """Register the clouds of a folder with each other and find one pose for each.
 
@@ -45,12 +44,12 @@ def multiway(
         graph: File for the poses and the pairs that were kept, in g2o format.
         plot: File for a picture of poses and pairs in their principal plane, such as graph.png.
     """
-    check_outputs(output, graph, cloud=map, picture=plot)
+    cli.check_outputs(output, graph, cloud=map, picture=plot)
     shared.check(method)
-    paths = clouds_in(folder, glob, map).paths
+    paths = cli.clouds_in(folder, glob, map).paths
     raw = [io.read(path, columns=shared.columns) for path in paths]
     names = [path.name for path in paths]
-    choices = Choices(shared, names, raw)
+    choices = cli.Choices(shared, names, raw)
     clouds = [choices.preprocess(name, cloud) for name, cloud in zip(names, raw, strict=True)]
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({choices.voxels})")
     name = choices.method_name(method)

@@ -19,8 +19,7 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics
 from mcgicp_jax import plot as plots
-from mcgicp_jax._cli.choices import Choices, with_channels
-from mcgicp_jax._cli.options import File, Method, Options, check_outputs, clouds_in, enumerated, shown, with_names
+from mcgicp_jax._cli import options as cli
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._compute.messages import check_integer
@@ -28,9 +27,9 @@ from mcgicp_jax._sequences.odometry import OdometryStep
 from mcgicp_jax.datasets import DATASETS, AbstractFrames
 
 if TYPE_CHECKING:
-    DatasetName: TypeAlias = str
+    FolderOrName: TypeAlias = Path | str
 else:
-    DatasetName = Literal[tuple(DATASETS)]
+    FolderOrName = Literal[tuple(DATASETS)] | Path
 
 Pose: TypeAlias = Float[np.ndarray, "4 4"]
 NumFrames: TypeAlias = int | Literal["all"]
@@ -38,37 +37,37 @@ NumFrames: TypeAlias = int | Literal["all"]
 _FRAMES_OF_A_SCENE = 20
 _RECORDED = [name for name, dataset in DATASETS.items() if not dataset.simulated]
 _MAX_DISTANCES = ", ".join(
-    f"{far:g} and {near:g} for {enumerated(list(names))}"
+    f"{far:g} and {near:g} for {cli.enumerated(list(names))}"
     for (far, near), names in itertools.groupby(DATASETS, lambda name: DATASETS[name].max_distance)
 )
 
 
 @partial(
-    with_names,
-    datasets=enumerated(_RECORDED, "or"),
-    scenes=enumerated([name for name, dataset in DATASETS.items() if dataset.simulated], "or"),
+    cli.with_names,
+    datasets=cli.enumerated(_RECORDED, "or"),
+    scenes=cli.enumerated([name for name, dataset in DATASETS.items() if dataset.simulated], "or"),
     max_distances=_MAX_DISTANCES,
 )
 def odometry(
-    dataset: Annotated[DatasetName | Path, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")],
-    path: Annotated[Path | None, tyro.conf.Positional, shown("PATH")] = None,
+    dataset: Annotated[FolderOrName, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")],
+    path: Annotated[Path | None, tyro.conf.Positional, cli.shown("PATH")] = None,
     *,
-    shared: Options,
-    method: Method = None,
+    shared: cli.Options,
+    method: cli.Method = None,
     num_frames: NumFrames = "all",
     every: int = 1,
     min_range: float = 0.0,
     max_range: float = float("inf"),
     against: Literal["previous", "map"] = "previous",
-    map_radius: Annotated[float | None, shown("FLOAT")] = None,
+    map_radius: Annotated[float | None, cli.shown("FLOAT")] = None,
     recover: bool = False,
     loops: bool = False,
     deskew: bool = False,
-    output: File = None,
+    output: cli.File = None,
     pose_format: Literal["kitti", "tum"] = "kitti",
     pose_frame: Literal["sensor", "camera"] = "sensor",
-    map: File = None,
-    plot: File = None,
+    map: cli.File = None,
+    plot: cli.File = None,
 ) -> int:
     """Estimate the sensor's trajectory by registering each frame of a sequence to the one before it, or to a map.
 
@@ -101,7 +100,7 @@ def odometry(
             that is off, the spacing of the points.
         plot: File for a picture of the trajectory in its principal plane, such as way.png.
     """
-    check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
+    cli.check_outputs(output, cloud=map, picture=plot, inputs=[path] if path else [])
     shared.check(method)
     check_integer("every", every, 1)
     if loops and (against == "map" or recover):
@@ -113,7 +112,7 @@ def odometry(
         raise ValueError(f"columns: expected none, since {dataset} has a layout of its own, got {shared.columns}")
     if deskew and every > 1:
         raise ValueError(f"--deskew: expected scans that follow each other without gaps, got --every {every}")
-    frames = _open(dataset, path, num_frames, every, map, shared, deskew)
+    frames = _open(dataset, path, num_frames, every, map, shared.columns, deskew)
     if (min_range, max_range) != (0, np.inf):
         frames = frames.crop(min_range, max_range)
     if pose_frame == "camera" and frames.to_camera is None:
@@ -130,7 +129,7 @@ def odometry(
     with contextlib.suppress(ValueError, OSError):
         start.append(frames[1].cloud)
     names = frames.name(0), frames.name(1)
-    choices = Choices(shared, names, start)
+    choices = cli.Choices(shared, names, start)
     name = choices.method_name(method)
     print(f"points:    {choices.voxels}")
 
@@ -151,7 +150,7 @@ def odometry(
         for frame in frames:
             truth.append(frame.pose)
             times.append(frame.time)
-            yield with_channels(frame.cloud, choices.channels)
+            yield cli.with_channels(frame.cloud, choices.channels)
 
     steps = mcg.odometry(clouds(), resolved_method, voxel_size=choices.voxels.size, **options)
     poses, results, failure = _follow(steps, frames, loops, map)
@@ -177,7 +176,13 @@ def odometry(
 
 
 def _open(
-    dataset: DatasetName | Path, path: File, num_frames: NumFrames, every: int, map: File, shared: Options, deskew: bool
+    dataset: FolderOrName,
+    path: cli.File,
+    num_frames: NumFrames,
+    every: int,
+    map: cli.File,
+    columns: int | None,
+    deskew: bool,
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")
@@ -194,7 +199,7 @@ def _open(
         frames = DATASETS[dataset].frames(path)
     elif dataset.is_dir():
         try:
-            frames = clouds_in(dataset, map=map, columns=shared.columns)
+            frames = cli.clouds_in(dataset, map=map, columns=columns)
         except ValueError as error:
             # Suggest the format of a data set whose files are in the folder.
             for name in _RECORDED:
@@ -205,7 +210,7 @@ def _open(
                 raise ValueError(f"{error}; it is a sequence: mcgicp odometry {name} {dataset}") from error
             raise
     else:
-        raise ValueError(f"{dataset}: expected a folder of clouds or one of {enumerated(list(DATASETS), 'or')}")
+        raise ValueError(f"{dataset}: expected a folder of clouds or one of {cli.enumerated(list(DATASETS), 'or')}")
     frames = frames if every == 1 else frames[::every]
     if len(frames) < 2:
         raise ValueError(f"{path or dataset}: expected at least 2 frames, got {len(frames)}")

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, same_channels
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
 from mcgicp_jax._clouds.voxels import grid_of, voxel_order
-from mcgicp_jax._compute.concrete import AnyArray, DeferredRows, outside_trace
+from mcgicp_jax._compute.concrete import DeferredRows, outside_trace
 from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._global_pose import robust_pose_fit as fit
@@ -291,10 +291,6 @@ class _Scene(NamedTuple):
     source_view: View
     target_view: View
 
-    def is_near(self, matrix: Float[np.ndarray, "4 4"], points: Float[AnyArray, "n 3"]) -> Bool[np.ndarray, "n"]:
-        moved = np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-        return nearest_in_position(moved, self.target.points, fit.TOLERANCE * self.voxel_size) >= 0
-
     def are_same(self, a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
         square = fit.squared_separation((a - b)[:3, :3], (a - b)[:3, 3], self.radius)
         return bool(square <= (fit.MIN_SEPARATION * self.voxel_size) ** 2)
@@ -303,16 +299,19 @@ class _Scene(NamedTuple):
         """The pose with its support: see `GlobalPoseResult.support`."""
         distance, valid = fit.TOLERANCE * self.voxel_size, np.asarray(self.matches.valid)
         matched, targets = (np.asarray(side, np.float64)[valid] for side in (self.matches.source, self.matches.target))
-        moved = matched @ matrix[:3, :3].T + matrix[:3, 3]
+        voxels = np.asarray(self.source.points, np.float64)
+        moved, moved_voxels = (points @ matrix[:3, :3].T + matrix[:3, 3] for points in (matched, voxels))
         inliers = int(np.sum(np.linalg.norm(moved - targets, axis=1) <= distance))
+        # Matches within the overlap, and the overlap.
+        num_within = int(np.sum(nearest_in_position(moved, self.target.points, distance) >= 0))
+        overlap = float(np.mean(nearest_in_position(moved_voxels, self.target.points, distance) >= 0))
         misfit, same = surface_agreement(matrix, self.source, self.target, distance)
         agreement = (same / max(misfit, 1.0)) ** 2
         num_voxels = min(len(cloud.points) for cloud in (self.source, self.target))
-        support = inliers / np.sqrt(max(self.is_near(matrix, matched).sum(), 1)) * agreement
+        support = inliers / np.sqrt(max(num_within, 1)) * agreement
         least = _LEAST * float(np.prod(np.maximum(_SPARSE / num_voxels, 1))) ** _SPARSE_POWER
         if not constrained:
             least = max(least, _LEAST_UNCONSTRAINED)
-        overlap = float(np.mean(self.is_near(matrix, self.source.points)))
         return Candidate(matrix, inliers, overlap, agreement, float(support / least))
 
     def in_free_space(self, matrix: Float[np.ndarray, "4 4"]) -> float:

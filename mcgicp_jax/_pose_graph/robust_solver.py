@@ -277,9 +277,9 @@ def _is_disputed(state: lm.GraphState, anchors: Edge, uncertain: lm.Mask) -> boo
     between = uncertain[:number] & (ends[:, 0] != ends[:, 1])
     keys, numbers = np.unique(ends[between] @ [size, 1], return_inverse=True)
     pairs = np.stack(np.divmod(keys, size), axis=1)
-    kept, total = np.bincount(numbers, state.weights[:number][between], len(pairs)), np.bincount(numbers)
-    joined = components(pairs[kept >= _AGREEING * total])
-    if not np.any((kept > 0) & (joined[pairs[:, 0]] != joined[pairs[:, 1]])):
+    num_accepted, total = np.bincount(numbers, state.weights[:number][between], len(pairs)), np.bincount(numbers)
+    joined = components(pairs[num_accepted >= _AGREEING * total])
+    if not np.any((num_accepted > 0) & (joined[pairs[:, 0]] != joined[pairs[:, 1]])):
         return False
     # Certain measurements of some directions, such as positions of all poses, may suffice together.
     return _is_degenerate(lm.GraphState.at(factors, 1.0 * ~uncertain, state.poses), anchors)
