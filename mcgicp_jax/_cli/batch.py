@@ -173,13 +173,8 @@ def _reader_and_arguments(
     name = choices.method_name(method)
     size = None if options.voxel_size == "off" else options.voxel_size
     print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
-
-    def preprocessed() -> tuple[mcg.PointCloud, mcg.PointCloud]:
-        return choices.preprocess(names[0], source), choices.preprocess(names[1], target)
-
-    arguments = {"method": choices.method(name, preprocessed), **choices.arguments(name, preprocessed)}
-    choices.print_method(name, arguments.get("max_distance", ()))
-    arguments |= {"voxel_size": size, "num_neighbors": options.num_neighbors}
+    resolved_method, arguments = choices.method_and_arguments(name)
+    arguments |= {"method": resolved_method, "voxel_size": size, "num_neighbors": options.num_neighbors}
     return partial(_read, choices.channels, options.columns), arguments
 
 

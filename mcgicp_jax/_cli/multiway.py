@@ -49,15 +49,14 @@ def multiway(
     paths = cli.clouds_in(folder, glob, map).paths
     raw = [io.read(path, columns=shared.columns) for path in paths]
     names = [path.name for path in paths]
-    choices = cli.Choices(shared, names, raw)
-    clouds = [choices.preprocess(name, cloud) for name, cloud in zip(names, raw, strict=True)]
+    choices = cli.Choices(shared, names, raw, target=0)
+    others = zip(names[2:], raw[2:], strict=True)
+    clouds = [*choices.preprocessed, *(choices.preprocess(name, cloud) for name, cloud in others)]
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({choices.voxels})")
     name = choices.method_name(method)
-    arguments = choices.arguments(name, lambda: (clouds[1], clouds[0]))
-    arguments |= {"init": None if init is None else list(io.read_poses(init))}
-    resolved_method = choices.method(name, lambda: (clouds[1], clouds[0]))
-    choices.print_method(name, arguments.get("max_distance", ()))
-    result = mcg.multiway(clouds, resolved_method, voxel_size=choices.voxels.size, **arguments)
+    initial_poses = None if init is None else list(io.read_poses(init))
+    resolved_method, arguments = choices.method_and_arguments(name)
+    result = mcg.multiway(clouds, resolved_method, init=initial_poses, voxel_size=choices.voxels.size, **arguments)
 
     edges, rejected = result.graph.edges, int((~np.asarray(result.graph.kept)).sum())
     print(f"pairs:     {len(result.registrations)} registered, {len(edges)} with a result, {rejected} of them rejected")

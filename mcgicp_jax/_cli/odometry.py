@@ -26,10 +26,11 @@ from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._sequences.odometry import OdometryStep
 from mcgicp_jax.datasets import DATASETS, AbstractFrames
 
+# Folder of clouds, or name of a data set.
 if TYPE_CHECKING:
-    FolderOrName: TypeAlias = Path | str
+    Frames: TypeAlias = Path | str
 else:
-    FolderOrName = Literal[tuple(DATASETS)] | Path
+    Frames = Literal[tuple(DATASETS)] | Path
 
 Pose: TypeAlias = Float[np.ndarray, "4 4"]
 NumFrames: TypeAlias = int | Literal["all"]
@@ -49,7 +50,7 @@ _MAX_DISTANCES = ", ".join(
     max_distances=_MAX_DISTANCES,
 )
 def odometry(
-    dataset: Annotated[FolderOrName, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")],
+    dataset: Annotated[Frames, tyro.conf.Positional, tyro.conf.arg(metavar="{FOLDER,DATASET}")],
     path: Annotated[Path | None, tyro.conf.Positional, cli.shown("PATH")] = None,
     *,
     shared: cli.Options,
@@ -129,18 +130,11 @@ def odometry(
     with contextlib.suppress(ValueError, OSError):
         start.append(frames[1].cloud)
     names = frames.name(0), frames.name(1)
-    choices = cli.Choices(shared, names, start)
+    choices = cli.Choices(shared, names, start, target=0)
     name = choices.method_name(method)
     print(f"points:    {choices.voxels}")
-
-    def source_and_target() -> tuple[mcg.PointCloud, mcg.PointCloud]:
-        return choices.preprocess(names[1], start[-1]), choices.preprocess(names[0], first.cloud)
-
-    resolved_method = choices.method(name, source_and_target)
-    options = choices.arguments(name, source_and_target)
-    if isinstance(dataset, str):
-        options.setdefault("max_distance", DATASETS[dataset].max_distance)
-    choices.print_method(name, options.get("max_distance", ()))
+    defaults = {"max_distance": DATASETS[dataset].max_distance} if isinstance(dataset, str) else {}
+    resolved_method, options = choices.method_and_arguments(name, **defaults)
     options |= {"num_neighbors": shared.num_neighbors, "against": against, "map_radius": map_radius}
     options |= {"recover": recover, "loops": loops, "deskew": deskew, "start": first.pose}
     truth: list[Pose | None] = []
@@ -176,13 +170,7 @@ def odometry(
 
 
 def _open(
-    dataset: FolderOrName,
-    path: cli.File,
-    num_frames: NumFrames,
-    every: int,
-    map: cli.File,
-    columns: int | None,
-    deskew: bool,
+    dataset: Frames, path: cli.File, num_frames: NumFrames, every: int, map: cli.File, columns: int | None, deskew: bool
 ) -> AbstractFrames:
     if num_frames != "all" and num_frames < 2:
         raise ValueError(f"num_frames: expected at least 2, got {num_frames}")

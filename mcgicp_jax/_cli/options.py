@@ -7,9 +7,10 @@ import errno
 import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from fnmatch import fnmatch
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
@@ -31,8 +32,6 @@ from mcgicp_jax.io.clouds import format_of, is_cloud
 from mcgicp_jax.io.text import read_text
 
 Documented = TypeVar("Documented")
-# Returns the preprocessed source and target.
-Preprocessed: TypeAlias = Callable[[], tuple[mcg.PointCloud, mcg.PointCloud]]
 
 
 def shown(metavar: str | None = None, default: str = "") -> Any:
@@ -215,12 +214,14 @@ class PairOptions(Options):
 
 
 class Choices:
-    """The user's options, completed from the raw clouds; messages call the first two of these by `names`."""
+    """The user's options, completed from the raw clouds; messages call the first two of these by `names`.
 
-    def __init__(self, options: Options, names: Sequence[str], clouds: Sequence[mcg.PointCloud]):
-        self.options = options
-        self.first_two = dict(zip(names, clouds[:2], strict=False))
-        common = [name for name in clouds[0].channel_names if all(name in cloud.channel_names for cloud in clouds[:2])]
+    Of these two, row `target` is the target and the other one the source; a single cloud is both.
+    """
+
+    def __init__(self, options: Options, names: Sequence[str], clouds: Sequence[mcg.PointCloud], target: int = 1):
+        self.options, self.names, self.clouds, self.target = options, names, clouds[:2], target
+        common = [name for name in clouds[0].channel_names if all(name in cloud.channel_names for cloud in self.clouds)]
         self.channels = options.channels or tuple(common)
         self.voxels: Voxels = voxels_for(None if options.voxel_size == "off" else options.voxel_size, *clouds)
 
@@ -235,18 +236,15 @@ class Choices:
         self.print_channels("" if method or self.channels else " in common, therefore gicp")
         return name
 
-    def print_method(self, name: str, max_distance: float | tuple[float, ...] = ()) -> None:
-        """The method and its distances, metres, if these do not follow from the clouds."""
-        distances = " m, then ".join(f"{distance:g}" for distance in np.atleast_1d(max_distance))
-        print(f"method:    {name}{f', matches up to {distances} m apart' if distances else ''}")
-
     def print_channels(self, consequence: str = "") -> None:
-        differ = not self.options.channels and len({cloud.channel_names for cloud in self.first_two.values()}) > 1
+        differ = not self.options.channels and len({cloud.channel_names for cloud in self.clouds}) > 1
         details = f" ({self._channels_of_each()})" if differ else ""
         print(f"channels:  {listed(self.channels)}{consequence}{details}")
 
     def _channels_of_each(self) -> str:
-        return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in self.first_two.items())
+        # Both may be the same file.
+        by_name = dict(zip(self.names, self.clouds, strict=False))
+        return ", ".join(f"{name} has {listed(cloud.channel_names)}" for name, cloud in by_name.items())
 
     def preprocess(self, name: str, cloud: mcg.PointCloud) -> mcg.PointCloud:
         """The preprocessed cloud; warnings and errors name it."""
@@ -255,22 +253,35 @@ class Choices:
         with messages_named(name):
             return mcg.preprocess(with_channels(cloud, self.channels), voxels, self.options.num_neighbors)
 
-    def method(self, name: str, preprocessed: Preprocessed) -> AbstractMethod:
+    @cached_property
+    def preprocessed(self) -> list[mcg.PointCloud]:
+        """The first two clouds."""
+        return list(map(self.preprocess, self.names, self.clouds))
+
+    def method(self, name: str) -> AbstractMethod:
         """The method with the user's parameters; the default weights of Color ICP are those of mc-gicp."""
         parameters = self.options.parameters(name)
         if issubclass(METHODS[name].kind, mcg.ColorICP) and not parameters:
-            resolved: Any = mcg.MultiChannelGICP().resolve(*preprocessed())
+            source, target = self.preprocessed[self.target - 1], self.preprocessed[self.target]
+            resolved: Any = mcg.MultiChannelGICP().resolve(source, target)
             parameters["channel_weights"] = resolved.channel_weights
         return METHODS[name](**parameters)
 
-    def arguments(self, name: str, preprocessed: Preprocessed) -> dict[str, Any]:
+    def arguments(self, name: str) -> dict[str, Any]:
         """Keyword arguments of `mcgicp_jax.register`; default sizes of cells come from the target."""
         arguments = self.options.registration()
         if METHODS[name].kind.needs_covariances and not self.options.voxel_sizes:
-            spacing = float(point_spacing(preprocessed()[1]))
+            spacing = float(point_spacing(self.preprocessed[self.target]))
             # With 8 spacings, a cell has some tens of points.
             arguments["voxel_sizes"] = tuple(float(f"{times * spacing:.2g}") for times in (32, 16, 8))
         return arguments
+
+    def method_and_arguments(self, name: str, **defaults: Any) -> tuple[AbstractMethod, dict[str, Any]]:
+        """`method` and `arguments`; prints the method, and its distances unless these follow from the clouds."""
+        method, arguments = self.method(name), defaults | self.arguments(name)
+        distances = " m, then ".join(f"{distance:g}" for distance in np.atleast_1d(arguments.get("max_distance", ())))
+        print(f"method:    {name}{f', matches up to {distances} m apart' if distances else ''}")
+        return method, arguments
 
 
 def with_channels(cloud: mcg.PointCloud, names: Sequence[str]) -> mcg.PointCloud:

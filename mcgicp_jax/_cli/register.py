@@ -55,8 +55,7 @@ class PreparedPair:
         self.raw = read(source), read(target)
         names = str(source), str(target)
         self.choices = cli.Choices(options, names, self.raw)
-        source_cloud, target_cloud = map(self.choices.preprocess, names, self.raw)
-        self.preprocessed = source_cloud, target_cloud
+        self.preprocessed = self.choices.preprocessed
         in_source, in_target = (f"{len(self.preprocessed[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
         print(f"points:    source {in_source}, target {in_target} ({self.choices.voxels})")
 
@@ -80,7 +79,8 @@ class PreparedPair:
     def method(self, name: str) -> AbstractMethod:
         """The method with parameters from the options, or else from the data as in `mcgicp_jax.register`."""
         options = RegistrationOptions(max_source_points=self.options.registration()["max_source_points"])
-        pair = prepared(*self.preprocessed, self.choices.method(name, lambda: self.preprocessed), options)
+        source, target = self.preprocessed
+        pair = prepared(source, target, self.choices.method(name), options)
         return resolved(pair.method, pair.source, pair.target, rows_to_match(pair.source, options))
 
     def errors(self, pose: Float[np.ndarray, "4 4"], true_pose: Float[np.ndarray, "4 4"]) -> str:
@@ -100,7 +100,7 @@ class PreparedPair:
         return verified(mcg.register(source, target, method, init=init, **self.arguments(name)), self.verified)
 
     def arguments(self, name: str) -> dict[str, Any]:
-        arguments = self.choices.arguments(name, lambda: self.preprocessed)
+        arguments = self.choices.arguments(name)
         if self.options.fix:
             variances = np.where(np.isin(_DIRECTIONS, sum(self.options.fix, ())), 0, _UNKNOWN)
             arguments["prior"] = self.start, np.diag(variances)
