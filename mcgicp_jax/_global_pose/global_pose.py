@@ -227,11 +227,9 @@ def global_pose(
             matches = matches_of_features(voxels[0], voxels[1], size)
         else:
             matches = matches_of_rows(source.coordinates - centers[0], target.coordinates - centers[1], rows)
-        neighbors = [np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS]) for cloud in voxels]
-        voxels = [
-            cloud.replace_rows(deferred_neighbors=DeferredRows.of(near))
-            for cloud, near in zip(voxels, neighbors, strict=True)
-        ]
+        for side, cloud in enumerate(voxels):
+            neighbors = np.ascontiguousarray(np.asarray(cloud.neighbors)[:, :_NUM_NEIGHBORS])
+            voxels[side] = cloud.replace_rows(deferred_neighbors=DeferredRows.of(neighbors))
         positions = np.asarray(voxels[0].points, np.float64)
         radius = float(np.sqrt(np.mean(np.sum(positions * positions, axis=1))))
         views = [View(np.asarray(cloud.points), -center) for cloud, center in zip(clouds, centers, strict=True)]
