@@ -194,7 +194,7 @@ def _chained(
         targets = zip(rows, starts, strict=True)
         results = [register_pair(clouds[k], clouds[i], method, start, options) for i, start in targets]
         # Overlap per distance of the matches, 1/m; 0 without a pose. MAX_ITERATIONS has one: on sparse points, updates
-        # may go to and fro at the right pose.
+        # may oscillate about the right pose.
         with np.errstate(divide="ignore"):
             fits = [float(np.asarray(r.overlap) / np.asarray(r.rmse)) if is_usable(r) else 0.0 for r in results]
         best = int(np.argmax(fits))

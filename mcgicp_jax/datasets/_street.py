@@ -122,8 +122,8 @@ def _observe(
     rays = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
     # Each pose of the turn measures one sector of the rays.
     poses, solids = poses.reshape(-1, 4, 4), [thing.solid for thing in things]
-    shares = zip(poses, np.array_split(rays, len(poses)), strict=True)
-    sectors = [raycast.cast(pose, share, solids, _MAX_RANGE) for pose, share in shares]
+    rays_by_pose = zip(poses, np.array_split(rays, len(poses)), strict=True)
+    sectors = [raycast.cast(pose, sector, solids, _MAX_RANGE) for pose, sector in rays_by_pose]
     hits = raycast.Hits(*map(np.concatenate, zip(*sectors, strict=True)))
     times = None if len(poses) == 1 else np.repeat(np.arange(len(poses)), [len(sector.rays) for sector in sectors])
 

@@ -22,11 +22,11 @@ _RGB_ARRAYS = ("rgb", "color", "colors", "colour", "colours")
 
 # Bound of the whole numbers of rings; the densest LiDARs have 128, and some count from 1.
 _MOST_RINGS = 256
-# Numbers of columns whose repetition is compared. A file is not of four columns if it repeats with another period that
-# is no multiple, so that values that far apart differ by less than this fraction of what those four apart do. (Of
-# periods that are not those of the file, 1.5 and more: KITTI, streets and rooms in scan order and shuffled.)
+# In a file of n columns, values differ least from those n places later. A file is not taken to have four columns if
+# they differ at one of these other distances by less than this fraction of the difference at four. (At distances other
+# than n the ratio is 1.5 and more: KITTI, streets and rooms, in scan order and shuffled.)
 _PERIODS, _REPEATS = (3, 5, 6, 7, 9, 10), 0.5
-# Values that are compared.
+# Number of values that are compared.
 _SAMPLE = 120_000
 # Numbers of columns that a refusal suggests where they fill the file.
 _SIZES = range(3, 11)
@@ -75,7 +75,7 @@ def _columns_of_floats(values: Float[np.ndarray, "n"], width: int | None) -> dic
             is_number = (ring == np.rint(ring)) & (ring >= 0) & (ring < _MOST_RINGS)
             if is_number.all() and (ring != ring[:1]).any():
                 return named(columns)
-    # Median difference of values that are so many columns apart.
+    # Median difference of values to those `size` places later.
     sample, steps = values[:_SAMPLE], {}
     for size in (4, *_PERIODS):
         differences = np.abs(sample[size:] - sample[:-size])
