@@ -57,10 +57,9 @@ class _CachedWithCloud:
     """The cached values of one cloud, by function; dropped when the cloud is collected."""
 
     def __init__(self, cloud: Any):
-        self.num_rows = cloud.points.shape[0]
-        # Refers to the identity, not to the cloud.
-        drop = partial(_clouds.drop, id(cloud))
-        self.alive = weakref.ref(cloud, lambda _: drop())
+        # The callback holds the identity, not the cloud.
+        self.num_rows, key = cloud.points.shape[0], id(cloud)
+        self.alive = weakref.ref(cloud, lambda _: _clouds.drop(key))
         self.values: dict[Callable[..., Any], Cache] = {}
 
 
@@ -93,7 +92,6 @@ def cached_with_cloud(compute: Callable[Parameters, Value]) -> Callable[Paramete
     return cached
 
 
-@jax.tree_util.register_pytree_node_class
 class Lazy(Generic[Value]):
     """A pytree that is computed on first access: by `value`, or when it is flattened, copied or pickled."""
 
@@ -121,30 +119,19 @@ class Lazy(Generic[Value]):
                 self._compute = self._finish = None
         return self._value
 
-    def tree_flatten(self) -> tuple[tuple[Value], None]:
-        return (self.value,), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, children: tuple[Value]) -> Lazy[Value]:
-        return cls.of(children[0])
-
     def __reduce__(self) -> Any:
         return Lazy.of, (self.value,)
 
 
-@jax.tree_util.register_pytree_node_class
 class Held(Generic[Value]):
     """A value that is dropped when the pytree is copied, pickled or returned by `jit`."""
 
     def __init__(self, value: Value | None = None):
         self.value = value
 
-    def tree_flatten(self) -> tuple[tuple[()], None]:
-        return (), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, __: tuple[()]) -> Held[Value]:
-        return cls()
-
     def __reduce__(self) -> Any:
         return Held, ()
+
+
+jax.tree_util.register_pytree_node(Lazy, lambda lazy: ((lazy.value,), None), lambda _, children: Lazy.of(*children))
+jax.tree_util.register_pytree_node(Held, lambda _: ((), None), lambda *_: Held())

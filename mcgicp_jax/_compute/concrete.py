@@ -30,7 +30,6 @@ else:
     AnyScalar = ArrayLike
 
 
-@jax.tree_util.register_pytree_node_class
 class DeferredRows:
     """An array, such as the neighbours of points, whose rows may be computed when they are needed.
 
@@ -45,8 +44,7 @@ class DeferredRows:
     def __init__(
         self, compute: Callable[[Any, int | None], np.ndarray], shape: tuple[int, ...], anew: Callable[[], Any] | None
     ):
-        self.shape, self._anew = shape, anew
-        self._table = RowsOnDemand(compute, shape[0])
+        self.shape, self._anew, self._table = shape, anew, RowsOnDemand(compute, shape[0])
 
     @classmethod
     def of(cls, whole: Any) -> DeferredRows:
@@ -67,17 +65,15 @@ class DeferredRows:
         rows.setflags(write=False)
         return rows
 
-    def tree_flatten(self) -> tuple[tuple[Any], None]:
-        return (self.whole,), None
-
-    @classmethod
-    def tree_unflatten(cls, _: None, children: tuple[Any]) -> DeferredRows:
-        return cls.of(children[0])
-
     def __reduce__(self) -> Any:
         if self._table is None or self._table.complete or self._anew is None:
             return DeferredRows.of, (self.whole,)
         return self._anew, ()
+
+
+jax.tree_util.register_pytree_node(
+    DeferredRows, lambda rows: ((rows.whole,), None), lambda _, children: DeferredRows.of(*children)
+)
 
 
 def is_deferred(node: object) -> bool:
@@ -108,9 +104,8 @@ def with_numpy_constants(tree: Any) -> Any:
     constants = {i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array) and not is_tracer(leaf)}
     if not constants or not is_tracer(_zero()):
         return tree
-    return jax.tree.unflatten(
-        structure, [np.asarray(leaf) if i in constants else leaf for i, leaf in enumerate(leaves)]
-    )
+    leaves = [np.asarray(leaf) if i in constants else leaf for i, leaf in enumerate(leaves)]
+    return jax.tree.unflatten(structure, leaves)
 
 
 # The state of JAX's transformations inside the context below; None outside of it.
