@@ -36,10 +36,8 @@ def on_cpu() -> contextlib.AbstractContextManager[Any]:
 def computed_on_cpu(function: Callable[Parameters, Answer]) -> Callable[Parameters, Answer]:
     @functools.wraps(function)
     def computed(*arguments: Parameters.args, **named: Parameters.kwargs) -> Answer:
-        # To enter a context takes longer than to ask.
-        if not on_accelerator():
-            return function(*arguments, **named)
-        with on_cpu():
+        # To enter a context of JAX takes longer than to ask.
+        with on_cpu() if on_accelerator() else contextlib.nullcontext():
             return function(*arguments, **named)
 
     return computed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import threading
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcgicp_jax._compute.devices import computed_on_cpu
+from mcgicp_jax._compute.devices import on_accelerator, on_cpu
 
 Result = TypeVar("Result")
 
@@ -43,10 +44,6 @@ class _Compilations:
 COMPILATIONS = _Compilations()
 jax.monitoring.register_event_duration_secs_listener(COMPILATIONS)
 
-# XLA's fusion emitters take a third to half of the time of compilation, and save at most a tenth of the time to run
-# (jaxlib 0.10.2): 1,024 neighbourhoods take 0.64 ms with them and 0.70 without, with two channels 1.06 and 1.15.
-_QUICK: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
-
 
 def quickly_compiled(function: Callable[..., Result], *, level: int | None = None) -> Callable[..., Result]:
     """`jax.jit` of a function that is called outside of other transformations; it runs on the CPU.
@@ -54,24 +51,29 @@ def quickly_compiled(function: Callable[..., Result], *, level: int | None = Non
     `level`: of LLVM's optimizations, for programs of a few small matrices: without (0), they compile in half the time,
     and with few (1), they also run as fast as with all.
     """
-    options = _QUICK if level is None else {**_QUICK, "xla_backend_optimization_level": level}
+    program = functools.cache(lambda: jax.jit(function, compiler_options=_options(level)))
 
-    @functools.cache
-    def program() -> Callable[..., Result]:
-        return jax.jit(function, compiler_options=_known(tuple(options.items())))
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Result:
+        with on_cpu() if on_accelerator() else contextlib.nullcontext():
+            return program()(*arguments)
 
-    return computed_on_cpu(functools.wraps(function)(lambda *arguments: program()(*arguments)))
+    return run
 
 
 @functools.cache
-def _known(options: tuple[tuple[str, bool | int], ...]) -> dict[str, bool | int]:
-    """The options, or none if this version of XLA no longer knows them."""
-    known = dict(options)
+def _options(level: int | None) -> dict[str, bool | int]:
+    """Options of the compiler; none if this version of XLA no longer knows them."""
+    # XLA's fusion emitters take a third to half of the time of compilation, and save at most a tenth of the time to run
+    # (jaxlib 0.10.2): 1,024 neighbourhoods take 0.64 ms with them and 0.70 without, with two channels 1.06 and 1.15.
+    options: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
+    if level is not None:
+        options["xla_backend_optimization_level"] = level
     try:
-        jax.jit(jnp.negative, compiler_options=known).lower(0.0).compile()
+        jax.jit(jnp.negative, compiler_options=options).lower(0.0).compile()
     except Exception:
         return {}
-    return known
+    return options
 
 
 # Bytes. JAX (jaxlib 0.10.2) copies smaller arrays for a callback in the calling thread, up to 100 KiB.
@@ -93,8 +95,7 @@ def call_host(function: Callable[..., Any], shapes: Any, *arguments: Any) -> Any
         pieces.append([array] if count <= 1 else jnp.array_split(array, count))
 
     def joined(*split: list[Any]) -> Any:
-        arrays = [list(map(np.asarray, parts)) for parts in split]
-        whole = [np.concatenate(parts) if len(parts) > 1 else parts[0] for parts in arrays]
+        whole = [np.concatenate(parts) if len(parts) > 1 else np.asarray(parts[0]) for parts in split]
         return function(*jax.tree.unflatten(structure, whole))
 
     return jax.pure_callback(joined, shapes, *pieces, vmap_method="sequential")
