@@ -6,7 +6,8 @@ import abc
 import itertools
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -37,19 +38,18 @@ class AbstractLinearMap(abc.ABC):
         """Cotangents of the inputs with numbers `moving`, one array (m, ...) for each, from those of the values."""
 
 
+@dataclass(frozen=True, eq=False)
 class KnownJacobian(AbstractLinearMap):
     """The derivative of one value of k numbers, (k, ...) by each of several arrays."""
 
-    def __init__(self, blocks: Sequence[np.ndarray]):
-        self._blocks = blocks
+    blocks: Sequence[np.ndarray]
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        blocks = [self._blocks[i] for i in moving]
-        pairs = zip(tangents, blocks, strict=True)
+        pairs = zip(tangents, [self.blocks[i] for i in moving], strict=True)
         return [sum(slope.reshape(len(slope), -1) @ block.reshape(len(block), -1).T for slope, block in pairs)]
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        return [np.tensordot(cotangents[0], self._blocks[i], 1) for i in moving]
+        return [np.tensordot(cotangents[0], self.blocks[i], 1) for i in moving]
 
 
 class SideBySide(AbstractLinearMap):
@@ -60,22 +60,19 @@ class SideBySide(AbstractLinearMap):
     def __init__(self, maps: Sequence[AbstractLinearMap], counts: Sequence[int]):
         self._maps, self._starts = maps, np.cumsum([0, *counts])
 
-    def _moving(self, moving: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """The numbers of the inputs of each map that are moving."""
-        return [
-            tuple(i - start for i in moving if start <= i < stop)
-            for start, stop in itertools.pairwise(self._starts.tolist())
-        ]
+    def _parts(self, moving: tuple[int, ...]) -> Iterator[tuple[AbstractLinearMap, tuple[int, ...]]]:
+        """Each map with the numbers of its inputs that are moving."""
+        for linear, (start, stop) in zip(self._maps, itertools.pairwise(self._starts.tolist()), strict=True):
+            yield linear, tuple(i - start for i in moving if start <= i < stop)
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        rest = iter(tangents)
-        parts = zip(self._maps, self._moving(moving), strict=True)
+        rest, parts = iter(tangents), self._parts(moving)
         values = side_by_side([partial(linear.jvp, [next(rest) for _ in inputs], inputs) for linear, inputs in parts])
         return [value for (value,) in values]
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        parts = zip(self._maps, cotangents, self._moving(moving), strict=True)
-        results = side_by_side([partial(linear.vjp, [cotangent], inputs) for linear, cotangent, inputs in parts])
+        parts = zip(cotangents, self._parts(moving), strict=True)
+        results = side_by_side([partial(linear.vjp, [cotangent], inputs) for cotangent, (linear, inputs) in parts])
         return list(itertools.chain.from_iterable(results))
 
 
@@ -136,9 +133,8 @@ class RowAverage(AbstractLinearMap):
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
         (tangent,) = tangents
-        shape = tangent.shape[2:]
+        shape, size = tangent.shape[2:], self._sum.shape[0]
         flat = tangent.reshape(*tangent.shape[:2], math.prod(shape))[:, self._rows]
-        size = self._sum.shape[0]
         return [np.stack([(self._sum @ (self._weights * rows)).reshape(size, *shape) for rows in flat])]
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
@@ -199,11 +195,6 @@ def _call(*operands: Any, function: Callable, transpose: Callable, inputs: Any, 
     ]
 
 
-@_linear.def_abstract_eval
-def _shapes(*_: Any, outputs: Any, batch: Any, **__: Any) -> Any:
-    return [aval.update(shape=(*batch, *aval.shape)) for aval in outputs]
-
-
 def _transposed(cotangents: Any, *_: Any, function: Any, transpose: Any, inputs: Any, outputs: Any, batch: Any) -> Any:
     swapped = {"function": transpose, "transpose": function, "inputs": outputs, "outputs": inputs}
     return _linear.bind(*map(ad.instantiate_zeros, cotangents), **swapped, batch=batch)
@@ -223,6 +214,7 @@ def _refused(*_: Any, message: str, **__: Any) -> Any:
     raise NotImplementedError(message)
 
 
+_linear.def_abstract_eval(lambda *_, outputs, batch, **__: [a.update(shape=(*batch, *a.shape)) for a in outputs])
 ad.deflinear2(_linear, _transposed)
 batching.primitive_batchers[_linear] = _batched
 # A callback would run compiled programs, which was seen to deadlock.

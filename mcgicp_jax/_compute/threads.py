@@ -9,6 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from operator import attrgetter
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -90,18 +91,17 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
     """
     if len(calls) == 1:
         return [calls[0]()]
-    answers: dict[int, Answer] = {}
-    waiting = collections.deque(enumerate(calls))
-    first, call = waiting.popleft()
+    answers: list[Any] = [None] * len(calls)
+    waiting = collections.deque(range(1, len(calls)))
 
     def work() -> None:
         while waiting:
             try:
-                i, call = waiting.popleft()
+                i = waiting.popleft()
             except IndexError:
                 # Another thread took the last call.
                 return
-            answers[i] = call()
+            answers[i] = calls[i]()
 
     helpers = []
     # On a single core, other threads would only take turns with this one.
@@ -112,7 +112,7 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
             for _ in range(min(len(calls), max_threads or len(calls)) - 1):
                 helpers.append(_threads().submit(elsewhere))
     try:
-        answers[first] = call()
+        answers[0] = calls[0]()
         work()
     finally:
         # After an error in this thread, calls still in the queue are dropped.
@@ -121,7 +121,7 @@ def side_by_side(calls: Sequence[Callable[[], Answer]], max_threads: int | None 
         wait(begun)
     for helper in begun:
         helper.result()
-    return [answers[i] for i in range(len(calls))]
+    return answers
 
 
 def in_new_thread(call: Callable[[], Answer]) -> Answer:
@@ -172,7 +172,7 @@ def with_settings(work: Callable[..., Answer], *, pickled: bool = False) -> Call
 
 
 def _settings() -> list[Any]:
-    return [setting.value for setting in _SETTINGS]
+    return list(map(attrgetter("value"), _SETTINGS))
 
 
 def _run_with(values: list[Any], work: Callable[..., Answer], *arguments: Any) -> Answer:
