@@ -15,6 +15,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property, partial, reduce
 from typing import Any, NamedTuple
 
@@ -27,7 +28,7 @@ from scipy.sparse import csc_array
 from mcgicp_jax._compute.concrete import is_concrete, is_tracer, outside_trace
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
-from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Layout, Packed, RowsOnDemand, blocks
+from mcgicp_jax._compute.tables import BLOCK, NEIGHBORHOOD_BLOCK, Block, Layout, Packed, RowsOnDemand, blocks
 from mcgicp_jax._compute.threads import in_new_thread, num_cores, side_by_side, with_settings_of_package
 
 # Points. Inside transformations, neighbourhoods of more points are processed in blocks, too: on CPUs XLA sums over the
@@ -40,7 +41,7 @@ _LARGEST_BLOCK = 8192
 Moving = frozenset[int]
 Slopes = dict[int, Any]
 # The places of the leaves of the numbers, and of the leaves of each input, by which a derivative is taken.
-Chosen = tuple[tuple[int, ...], ...]
+Places = tuple[tuple[int, ...], ...]
 
 
 class Rows(NamedTuple):
@@ -108,7 +109,7 @@ class RowFunction:
     """
 
     def __init__(self, function: Any, numbers: Any, inputs: Sequence[Input], size: int, total: bool = False):
-        self._function, self.size, self._total = function, size, total
+        self._function, self.size, self.total = function, size, total
         self._inputs = [
             entry if isinstance(entry.table, Table) else entry._replace(table=GivenTable(entry.table))
             for entry in inputs
@@ -136,34 +137,35 @@ class RowFunction:
         return [array for array in self.arrays.values() if is_tracer(array)]
 
     def rows(self, rows: Int[np.ndarray, "n"] | None = None, num_threads: int | None = 1) -> tuple[Packed, ...]:
-        results = self._over_blocks(rows, num_threads)
-        size, first = results[-1][0].stop, results[0][1]
-        tables = [np.empty((size, *part.table.shape[1:]), part.table.dtype) for part in first]
-        for places, parts in results:
+        cut, results = self._over_blocks(rows, num_threads)
+        size = cut[-1][0].stop
+        tables = [np.empty((size, *part.table.shape[1:]), part.table.dtype) for part in results[0]]
+        for (places, _), parts in zip(cut, results, strict=True):
             for table, part in zip(tables, parts, strict=True):
                 table[places] = np.asarray(part.table)[: places.stop - places.start]
-        return tuple(map(Packed, tables, [part.layout for part in first]))
+        return tuple(map(Packed, tables, [part.layout for part in results[0]]))
 
     def sums(self, num_threads: int | None = 1, packed: bool = True) -> list[Any]:
         """The sum over each block. Programs may not have ended."""
-        return [part for _, part in self._over_blocks(None, num_threads, packed)]
+        return self._over_blocks(None, num_threads, packed)[1]
 
     @with_settings_of_package
-    def _over_blocks(self, rows: Any, num_threads: int | None, packed: bool = True) -> list[tuple[slice, Any]]:
-        gathered = _Gathered(self._inputs, self.size, self._total, rows, num_threads)
-        program = _program(self._function, self._total, packed)
+    def _over_blocks(self, rows: Any, num_threads: int | None, packed: bool = True) -> tuple[list[Block], list[Any]]:
+        """The blocks, and the result for each."""
+        gathered = _Gathered(self._inputs, self.size, self.total, rows, num_threads)
+        program = _program(self._function, self.total, packed)
 
-        def run(places: slice, index: Any) -> tuple[slice, Any]:
-            return places, program(self._numbers, *gathered.block(index))
+        def run(_: slice, index: Any) -> Any:
+            return program(self._numbers, *gathered.block(index))
 
         # Worker threads run outside a trace that is active in this thread; this thread leaves it for the same results.
         with outside_trace():
-            return side_by_side([partial(run, *block) for block in gathered.blocks], num_threads)
+            return gathered.blocks, side_by_side([partial(run, *block) for block in gathered.blocks], num_threads)
 
     def value_and_jacobian(self, wanted: Sequence[int]) -> tuple[np.ndarray, list[np.ndarray]]:
         """A sum, packed, and its derivative (L, ...) by the leaves of `numbers` with these numbers; float64."""
         program = _jacobian_program(self._function, (tuple(wanted), *(() for _ in self._inputs)))
-        gathered = _Gathered(self._inputs, self.size, self._total)
+        gathered = _Gathered(self._inputs, self.size, self.total)
         results = gathered.in_order(lambda _, index: program(self._numbers, *gathered.block(index)))
         parts = [jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), part) for part in results]
         return reduce(partial(jax.tree.map, np.add), parts)
@@ -172,62 +174,62 @@ class RowFunction:
         """Cotangents (c, ...) of some arrays, from those of the sum or of the rows, as `vjp` takes them."""
         into: Slopes = {}
         self.vjp(cotangents, frozenset(map(id, leaves)), into)
-        count = cotangents.shape[0 if self._total else 1]
+        count = cotangents.shape[0 if self.total else 1]
         return [into.get(id(leaf), np.zeros((count, *np.shape(leaf)))) for leaf in leaves]
 
     def vjp(self, cotangents: Any, moving: Moving, into: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> None:
         """Add the cotangents of what is moving to `into`, from those of the sum, (c, L), packed, or of the rows,
         (N, c, L). `rows`: those whose cotangents are not 0; None for all."""
-        numbers, *columns = chosen = self._chosen(moving)
-        if not any(chosen):
+        numbers, *columns = places_of_leaves = self._places_of(moving)
+        if not any(places_of_leaves):
             return
-        gathered = _Gathered(self._inputs, self.size, self._total, rows)
-        program, count = _vjp_program(self._function, self._total, chosen), cotangents.shape[0 if self._total else 1]
+        gathered = _Gathered(self._inputs, self.size, self.total, rows)
+        program = _vjp_program(self._function, self.total, places_of_leaves)
 
         def run(places: slice, index: Any) -> Any:
             packs, indices = gathered.block(index)
             of_block = cotangents
-            if not self._total:
+            if not self.total:
                 of_rows = cotangents[places if rows is None else rows[places]]
                 of_block = np.zeros((gathered.block_size, *of_rows.shape[1:]), of_rows.dtype)
                 of_block[: len(of_rows)] = of_rows
             return places, indices, *jax.tree.map(np.asarray, program(self._numbers, packs, indices, of_block))
 
-        used = {j: gathered.used(j) for j, places in enumerate(columns) if places}
+        rows_of_tables = {j: gathered.rows_of_table(j) for j, places in enumerate(columns) if places}
         slopes: dict[int, np.ndarray] = {}
-        scratch: dict[int, np.ndarray] = {}
         for places, indices, by_numbers, by_rows in gathered.in_order(run):
             for i, by in zip(numbers, by_numbers, strict=True):
                 key = id(self._leaves[i])
                 into[key] = into.get(key, 0) + by.astype(np.float64)
-            live = (..., slice(0, places.stop - places.start))
-            for j in used:
-                of_rows, by = indices[j][live], by_rows[j][(*live, slice(None), slice(None))]
+            count = places.stop - places.start
+            for j, rows_of_table in rows_of_tables.items():
+                of_rows, by = indices[j][..., :count], by_rows[j][..., :count, :, :]
                 if j not in slopes:
-                    size = self._inputs[j].table.size
-                    slopes[j], scratch[j] = np.zeros((size, count, by.shape[-1]), by.dtype), np.empty(size, int)
-                if gathered.repeats(j, used[j]):
-                    _add_rows(slopes[j], of_rows, by, scratch[j])
-                else:
+                    slopes[j] = np.zeros((self._inputs[j].table.size, *by.shape[-2:]), by.dtype)
+                index = gathered.indices[j]
+                if index is None or index.size == rows_of_table.size:
+                    # No row occurs twice, and none is missing (−1).
                     slopes[j][of_rows] = by
+                else:
+                    _add_rows(slopes[j], of_rows, by)
         for j, slope in slopes.items():
-            self._inputs[j].table.vjp(slope, moving, into, used[j])
+            self._inputs[j].table.vjp(slope, moving, into, rows_of_tables[j])
 
     def jvp(self, tangents: Slopes, rows: Int[np.ndarray, "n"] | None = None) -> np.ndarray:
         """Tangents (c, L) of the sum, packed, or (n, c, L) of the rows, from those (c, ...) of arrays. A scalar 0 if it
         depends on none of them."""
-        numbers, *columns = chosen = self._chosen(frozenset(tangents))
-        if not any(chosen):
+        numbers, *columns = places_of_leaves = self._places_of(frozenset(tangents))
+        if not any(places_of_leaves):
             return np.zeros(())
-        gathered = _Gathered(self._inputs, self.size, self._total, rows)
-        program = _jvp_program(self._function, self._total, chosen)
+        gathered = _Gathered(self._inputs, self.size, self.total, rows)
+        program = _jvp_program(self._function, self.total, places_of_leaves)
         by_numbers = [tangents[id(self._leaves[i])].astype(np.result_type(self._leaves[i])) for i in numbers]
         slopes: dict[int, np.ndarray] = {}
         for j, table in ((j, self._inputs[j].table) for j, places in enumerate(columns) if places):
-            used = gathered.used(j)
-            of_used = table.jvp(tangents, used)
-            slopes[j] = np.zeros((table.size, *of_used.shape[1:]), of_used.dtype)
-            slopes[j][used] = of_used
+            rows_of_table = gathered.rows_of_table(j)
+            by = table.jvp(tangents, rows_of_table)
+            slopes[j] = np.zeros((table.size, *by.shape[1:]), by.dtype)
+            slopes[j][rows_of_table] = by
 
         def run(places: slice, index: Any) -> np.ndarray:
             packs, indices = gathered.block(index)
@@ -236,12 +238,12 @@ class RowFunction:
                 for j, (pack, index) in enumerate(zip(packs, indices, strict=True))
             ]
             result = np.asarray(program(self._numbers, packs, indices, by_numbers, by_rows))
-            return result.astype(np.float64) if self._total else result[:, : places.stop - places.start]
+            return result.astype(np.float64) if self.total else result[:, : places.stop - places.start]
 
         results = list(gathered.in_order(run))
-        return np.sum(results, axis=0) if self._total else np.concatenate(results, axis=1).swapaxes(0, 1)
+        return np.sum(results, axis=0) if self.total else np.concatenate(results, axis=1).swapaxes(0, 1)
 
-    def _chosen(self, moving: Moving) -> Chosen:
+    def _places_of(self, moving: Moving) -> Places:
         """The places of the numbers, and of the columns of each input, that depend on the moving arrays."""
         numbers = tuple(i for i, leaf in enumerate(self._leaves) if id(leaf) in moving)
         return numbers, *(() if entry.part else entry.table.columns(moving) for entry in self._inputs)
@@ -284,23 +286,23 @@ class _Gathered:
         self._total, self._whole = total, rows is None
         self._rows = np.arange(size, dtype=np.int32) if rows is None else rows
         self.size, self.block_size = len(self._rows), BLOCK
-        self._indices, self._packs = [], []
+        self.indices, self._packs = [], []
         for table, index, part in inputs:
-            used = rows
+            rows_of_table = rows
             if index is not None:
                 # Of all rows at once: neighbours are found on the way.
                 index = np.asarray(index[slice(None) if rows is None else rows], np.int32)
-                used = np.maximum(index, 0).reshape(-1)
+                rows_of_table = np.maximum(index, 0).reshape(-1)
                 if index.ndim == 2 and index.shape[1] > 1:
                     self.block_size = NEIGHBORHOOD_BLOCK
-            self._packs.append(table.computed(used, num_threads)[part])
-            self._indices.append(index)
+            self._packs.append(table.computed(rows_of_table, num_threads)[part])
+            self.indices.append(index)
         self.blocks = blocks(self.size, self.block_size)
 
     def block(self, rows: Any) -> tuple[tuple[Packed, ...], tuple[Any, ...]]:
         """The rows of a block (see `blocks`) and their numbers; −1 for padding, which must not add to a sum."""
         packs, numbers = [], []
-        for pack, index in zip(self._packs, self._indices, strict=True):
+        for pack, index in zip(self._packs, self.indices, strict=True):
             if index is None:
                 packs.append(pack.rows(rows if self._whole else self._rows[rows]))
                 number = np.array(self._rows[rows], np.int32)
@@ -318,18 +320,14 @@ class _Gathered:
         for start in range(0, len(self.blocks), at_once):
             yield from side_by_side([partial(run, *block) for block in self.blocks[start : start + at_once]])
 
-    def repeats(self, j: int, used: Int[np.ndarray, "n"]) -> bool:
-        """Whether the index of input `j` has a row more than once, or −1."""
-        return self._indices[j] is not None and self._indices[j].size > used.size
-
-    def used(self, j: int) -> Int[np.ndarray, "n"]:
+    def rows_of_table(self, j: int) -> Int[np.ndarray, "n"]:
         """The rows of the table of input `j` that are used."""
-        index = self._indices[j]
+        index = self.indices[j]
         if index is None:
             return self._rows
-        used = np.zeros(len(self._packs[j].table), bool)
-        used[index[index >= 0]] = True
-        return np.flatnonzero(used)
+        occurs = np.zeros(len(self._packs[j].table), bool)
+        occurs[index[index >= 0]] = True
+        return np.flatnonzero(occurs)
 
 
 @with_settings_of_package
@@ -382,7 +380,7 @@ def blockwise(function: Callable[..., Any], numbers: Any, *inputs: Input, total:
                 raise ValueError(
                     f"function: expected floats to differentiate, and others in a second tree, got {leaf.dtype}"
                 )
-        leaves = with_derivative(leaves, _Derivative(applied, total, packs[0].layout), applied.tracers)
+        leaves = with_derivative(leaves, _Derivative(applied, packs[0].layout), applied.tracers)
     elif total:
         leaves = [jax.device_put(leaf) for leaf in leaves]
     first = jax.tree.unflatten(structure, leaves)
@@ -395,23 +393,24 @@ def size_of(first: Input) -> int:
     return first.table.size if isinstance(first.table, Table) else len(jax.tree.leaves(first.table)[0])
 
 
+@dataclass(frozen=True, eq=False)
 class _Derivative(AbstractLinearMap):
-    """The derivative of the arrays that a row function returns."""
+    """The derivative of the arrays that a row function returns, which lie in a table as `layout` says."""
 
     runs_programs = True
 
-    def __init__(self, applied: RowFunction, total: bool, layout: Layout):
-        self._applied, self._total, self._layout = applied, total, layout
-        self._leaves = applied.tracers
+    applied: RowFunction
+    layout: Layout
 
     def jvp(self, tangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        results = self._applied.jvp({id(self._leaves[i]): by for i, by in zip(moving, tangents, strict=True)})
-        return jax.tree.leaves(Packed(results if self._total else results.swapaxes(0, 1), self._layout).tree)
+        leaves = [self.applied.tracers[i] for i in moving]
+        table = self.applied.jvp({id(leaf): by for leaf, by in zip(leaves, tangents, strict=True)})
+        return jax.tree.leaves(Packed(table if self.applied.total else table.swapaxes(0, 1), self.layout).tree)
 
     def vjp(self, cotangents: Sequence[np.ndarray], moving: tuple[int, ...]) -> list[np.ndarray]:
-        packed = Packed.of(list(cotangents), num_axes=1 if self._total else 2).table
-        packed = packed if self._total else packed.swapaxes(0, 1)
-        return self._applied.cotangents(packed, [self._leaves[i] for i in moving])
+        table = Packed.of(list(cotangents), num_axes=1 if self.applied.total else 2).table
+        table = table if self.applied.total else table.swapaxes(0, 1)
+        return self.applied.cotangents(table, [self.applied.tracers[i] for i in moving])
 
 
 def over_whole(function: Callable[..., Any], numbers: Any, inputs: Sequence[Input], total: bool = False) -> Any:
@@ -469,21 +468,18 @@ def whole(entry: Input, rows: Any = None, spread: bool = False) -> Rows:
 
 
 def _add_rows(
-    total: Float[np.ndarray, "N c W"],
-    rows: Int[np.ndarray, "*k n"],
-    values: Float[np.ndarray, "*k n c W"],
-    scratch: Int[np.ndarray, "N"],
+    total: Float[np.ndarray, "N c W"], rows: Int[np.ndarray, "*k n"], values: Float[np.ndarray, "*k n c W"]
 ) -> None:
-    """Add values to rows that may repeat; negative ones are left out. `scratch` has any values. `np.add.at` takes ten
-    times as long."""
+    """Add values to rows that may repeat; negative ones are left out. `np.add.at` takes ten times as long."""
     rows, values = rows.reshape(-1), values.reshape(rows.size, -1)
     weights, rows, numbers = (rows >= 0).astype(values.dtype), np.maximum(rows, 0), np.arange(rows.size + 1)
     # Distinct rows: each has the number of its last entry. Sorting would take three times as long as the sum.
-    scratch[rows] = numbers[:-1]
-    last = scratch[rows]
-    used = last == numbers[:-1]
-    places = (np.cumsum(used) - 1)[last]
-    distinct = rows[used]
+    last_entry = np.empty(len(total), int)
+    last_entry[rows] = numbers[:-1]
+    last = last_entry[rows]
+    is_last = last == numbers[:-1]
+    places = (np.cumsum(is_last) - 1)[last]
+    distinct = rows[is_last]
     sums = csc_array((weights, places, numbers), shape=(len(distinct), rows.size)) @ values
     total[distinct] += sums.reshape(len(distinct), *total.shape[1:])
 
@@ -504,15 +500,15 @@ def _program(function: Callable[..., Any], total: bool, packed: bool) -> Callabl
     return quickly_compiled(program)
 
 
-def _of_chosen(
-    function: Callable[..., Any], total: bool, chosen: Chosen, numbers: Any, packs: Any, indices: Any
+def _of_leaves(
+    function: Callable[..., Any], total: bool, places_of_leaves: Places, numbers: Any, packs: Any, indices: Any
 ) -> tuple[Callable[[Any], Any], list[list[Any]]]:
-    """The packed result as a function of the chosen leaves; and these leaves."""
+    """The packed result as a function of the leaves at these places; and these leaves."""
     trees = [jax.tree.flatten(tree) for tree in (numbers, *(pack.tree for pack in packs))]
 
     def result(moved: list[list[Any]]) -> Any:
         replaced = []
-        for (leaves, structure), places, values in zip(trees, chosen, moved, strict=True):
+        for (leaves, structure), places, values in zip(trees, places_of_leaves, moved, strict=True):
             leaves = leaves.copy()
             for i, value in zip(places, values, strict=True):
                 leaves[i] = value
@@ -520,36 +516,33 @@ def _of_chosen(
         value = function(replaced[0], *map(Rows, replaced[1:], indices))
         return Packed.of(value if total else value[0], num_axes=0 if total else 1).table
 
-    return result, [[leaves[i] for i in places] for (leaves, _), places in zip(trees, chosen, strict=True)]
+    return result, [[leaves[i] for i in places] for (leaves, _), places in zip(trees, places_of_leaves, strict=True)]
 
 
 @cache
-def _vjp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
-    """The vector-Jacobian product of a block for c cotangents: of the chosen numbers, (c, ...), and of the chosen
+def _vjp_program(function: Callable[..., Any], total: bool, places: Places) -> Callable[..., Any]:
+    """The vector-Jacobian product of a block for c cotangents: of the numbers at these places, (c, ...), and of the
     columns of each input side by side, (n, c, W) or (k, n, c, W); None where there are none."""
 
     def program(numbers: Any, packs: Any, indices: Any, cotangents: Any) -> Any:
-        result, here = _of_chosen(function, total, chosen, numbers, packs, indices)
-        ((by_numbers, *by_rows),) = jax.vmap(jax.vjp(result, here)[1], in_axes=0 if total else 1)(cotangents)
-        return by_numbers, [
-            jnp.moveaxis(
-                jnp.concatenate([by.reshape(*by.shape[: 1 + index.ndim], -1) for by in columns], axis=-1), 0, -2
-            )
-            if columns
-            else None
-            for columns, index in zip(by_rows, indices, strict=True)
-        ]
+        result, here = _of_leaves(function, total, places, numbers, packs, indices)
+        ((by_numbers, *by_columns),) = jax.vmap(jax.vjp(result, here)[1], in_axes=0 if total else 1)(cotangents)
+        by_rows = []
+        for columns, index in zip(by_columns, indices, strict=True):
+            columns = [by.reshape(*by.shape[: 1 + index.ndim], -1) for by in columns]
+            by_rows.append(jnp.moveaxis(jnp.concatenate(columns, axis=-1), 0, -2) if columns else None)
+        return by_numbers, by_rows
 
     program.__name__ = f"vjp_{function.__name__}"
     return quickly_compiled(program)
 
 
 @cache
-def _jvp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> Callable[..., Any]:
+def _jvp_program(function: Callable[..., Any], total: bool, places: Places) -> Callable[..., Any]:
     """Jacobian-vector products of a block, (c, L) or (c, n, L); tangents are (c, n, W) or (c, k, n, W)."""
 
     def program(numbers: Any, packs: Any, indices: Any, by_numbers: Any, by_rows: Any) -> Any:
-        result, here = _of_chosen(function, total, chosen, numbers, packs, indices)
+        result, here = _of_leaves(function, total, places, numbers, packs, indices)
         slopes = [by_numbers]
         for columns, joined, index in zip(here[1:], by_rows, indices, strict=True):
             ends = np.cumsum([math.prod(column.shape[index.ndim :]) for column in columns])
@@ -562,11 +555,11 @@ def _jvp_program(function: Callable[..., Any], total: bool, chosen: Chosen) -> C
 
 
 @cache
-def _jacobian_program(function: Callable[..., Any], chosen: Chosen) -> Callable[..., Any]:
-    """A sum over a block, packed, and its derivative by the chosen numbers."""
+def _jacobian_program(function: Callable[..., Any], places: Places) -> Callable[..., Any]:
+    """A sum over a block, packed, and its derivative by the numbers at these places."""
 
     def program(*arguments: Any) -> Any:
-        result, here = _of_chosen(function, True, chosen, *arguments)
+        result, here = _of_leaves(function, True, places, *arguments)
         value, vjp = jax.vjp(result, here)
         return value, jax.vmap(vjp)(jnp.eye(len(value), dtype=value.dtype))[0][0]
 
