@@ -51,8 +51,10 @@ class PointToPlane(base.AbstractOneSided):
     """Point-to-plane ICP (Chen & Medioni 1991): M = n nᵀ with the normals n of the target."""
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
-        given = around.given_covariance
-        return alg.outer(base.known_geometry(local).normal.T if given is None else alg.smallest_eigenvector(given))
+        covariance = around.given_covariance
+        if covariance is not None:
+            return alg.outer(alg.smallest_eigenvector(covariance))
+        return alg.outer(base.known_geometry(local).normal.T)
 
 
 class ColorICP(base.AbstractOneSided):
@@ -80,8 +82,7 @@ class ColorICP(base.AbstractOneSided):
     def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> ColorICP:
         """The method with `missing_variance` set to the Λ that `MultiChannelGICP` chooses, if points lack channels;
         constant to autodiff."""
-        lacking = source.channel_valid is not None or target.channel_valid is not None
-        if not lacking or self.missing_variance is not None:
+        if self.missing_variance is not None or (source.channel_valid is None and target.channel_valid is None):
             return self
         variance = MultiChannelGICP(channel_weights=0.0).resolve(source, target, geometries).channel_covariance
         return eqx.tree_at(lambda method: method.missing_variance, self, variance, is_leaf=lambda leaf: leaf is None)

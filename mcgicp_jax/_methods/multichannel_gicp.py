@@ -121,11 +121,10 @@ class MultiChannelGICP(base.AbstractGeneralized):
         """
         if self.channel_covariance is not None and self.channel_weights is not None:
             return self
-        geometries = geometries or partial(local_geometries, source, target, True)
+        noise = channel_noise(source, target, geometries or partial(local_geometries, source, target, True))
+        epsilon = jnp.asarray(_EPSILON) if self.epsilon is None else self.epsilon
         # Not of the clouds, whose concrete arrays would be traced, too.
-        (sigma, uniform, across, ratio), spacing, epsilon = constant(
-            (channel_noise(source, target, geometries), point_spacing(target), self._epsilon)
-        )
+        (sigma, uniform, across, ratio), spacing, epsilon = constant((noise, point_spacing(target), epsilon))
         xp = numpy_for(source, target, sigma, across, epsilon)
         with np.errstate(over="ignore", invalid="ignore"):
             within = xp.asarray(epsilon, spacing.dtype) * _MATCH_VARIANCE * spacing**2
@@ -156,13 +155,13 @@ class MultiChannelGICP(base.AbstractGeneralized):
         return (Photometric.before_estimate(spacing, count, Mahalanobis(self), robust, equalize_channels),)
 
     def covariance(self, around: Neighborhoods, local: LocalGeometry | None) -> Float[Array, "6 n"]:
-        given = around.given_covariance
-        if given is not None:
-            return given
+        if around.given_covariance is not None:
+            return around.given_covariance
         if around.near is None:
             raise ValueError(NO_NEIGHBORS)
         local, dtype = base.known_geometry(local), around.own.dtype
-        epsilon, covariance = self._epsilon.astype(dtype), self._covariance_for(around.num_channels).astype(dtype)
+        epsilon = jnp.asarray(_EPSILON if self.epsilon is None else self.epsilon, dtype)
+        covariance = self._covariance_for(around.num_channels).astype(dtype)
         if around.num_channels == 0:
             return plane_covariance(local, epsilon)
         floor = jnp.asarray(_MIN_EIGENVALUE if self.min_eigenvalue is None else self.min_eigenvalue, dtype)
@@ -177,10 +176,6 @@ class MultiChannelGICP(base.AbstractGeneralized):
         covariance = self._covariance_for(num_channels)
         xp = numpy_for(covariance)
         return xp.broadcast_to(xp.diagonal(covariance) if covariance.ndim == 2 else covariance, (num_channels,))
-
-    @property
-    def _epsilon(self) -> Float[Array, ""]:
-        return jnp.asarray(_EPSILON) if self.epsilon is None else self.epsilon
 
     def _covariance_for(self, count: int) -> Float[Array, "..."]:
         """Λ, which must be chosen and fit clouds of `count` channels."""

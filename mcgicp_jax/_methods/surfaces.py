@@ -18,18 +18,9 @@ from mcgicp_jax._compute.cache import cached_with_cloud
 from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.row_functions import ComputedTable, GivenTable, Input, Rows, over_both
 from mcgicp_jax._compute.threads import side_by_side
-from mcgicp_jax._local_geometry.local_geometry import (
-    LocalGeometry,
-    Surface,
-    SurfaceNoise,
-    differentiable_geometry,
-    geometry_of_cells,
-    geometry_table,
-    joined,
-    local_geometries,
-    separated,
-)
-from mcgicp_jax._local_geometry.neighborhoods import Neighborhoods, PointRows, neighborhoods, of_rows, with_near
+from mcgicp_jax._local_geometry import local_geometry as geo
+from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, Surface
+from mcgicp_jax._local_geometry.neighborhoods import PointRows, neighborhoods, of_rows, with_near
 from mcgicp_jax._local_geometry.observability import channel_observability
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -139,10 +130,10 @@ def surface_pair(
         source_rows: the rows of the surface of the source, with neighbours among all points; None for all rows.
     """
     matched = source if source_rows is None else _some_rows(source, source_rows)
-    whole = cache(partial(local_geometries, source, target, method.uses_channels, (source_rows, None), num_threads))
+    whole = cache(partial(geo.local_geometries, source, target, method.uses_channels, (source_rows, None), num_threads))
     method = resolved(method, source, target, source_rows, num_threads, whole)
     terms = method.terms(matched, target, robust, equalize_channels)
-    kinds = kinds_of(terms)
+    kinds = tuple(type(term) for term in terms if term.name)
     # Raises an error if observability is needed and a cloud has no neighbours.
     with_geometry = observed or (source.deferred_neighbors is not None and target.deferred_neighbors is not None)
     if is_concrete(method, source, target):
@@ -155,8 +146,8 @@ def surface_pair(
         return SurfacePair(method, terms, of_source, of_target)
     inputs = [of_rows(_inputs(method, source, with_geometry), source_rows), _inputs(method, target, with_geometry)]
     if with_geometry:
-        inputs = [[*rows, *map(Input, separated(local))] for rows, local in zip(inputs, whole(), strict=True)]
-    parts = over_both(_surface_rows(kinds, observed, with_geometry), method, *inputs)
+        inputs = [[*rows, *map(Input, geo.separated(local))] for rows, local in zip(inputs, whole(), strict=True)]
+    parts = over_both(surface_of(kinds, observed, with_geometry), method, *inputs)
     surfaces = _surface_in(parts[0], searchable(method, matched)), _surface_in(parts[1], searchable(method, target))
     return SurfacePair(method, terms, *surfaces)
 
@@ -174,7 +165,7 @@ def resolved(
     def geometries(rows: tuple[Any, Any]) -> tuple[LocalGeometry, LocalGeometry]:
         if whole is None or is_concrete(source, target):
             rows = rows if source_rows is None else (source_rows[rows[0]], rows[1])
-            return local_geometries(source, target, method.uses_channels, rows, num_threads)
+            return geo.local_geometries(source, target, method.uses_channels, rows, num_threads)
         # Inside transformations all rows are needed anyway.
         of_source, of_target = (jax.tree.map(itemgetter(i), local) for local, i in zip(whole(), rows, strict=True))
         return of_source, of_target
@@ -182,12 +173,8 @@ def resolved(
     return method.resolve(source if source_rows is None else _some_rows(source, source_rows), target, geometries)
 
 
-def kinds_of(terms: tuple[AbstractTerm, ...]) -> Kinds:
-    return tuple(type(term) for term in terms if term.name)
-
-
 def covariances_of(method: AbstractMethod, cloud: PointCloud) -> Float[np.ndarray, "N 3 3"]:
-    surface = surface_pair(method, cloud, cloud, observed=False).whole().source
+    surface = whole_surface(surface_pair(method, cloud, cloud, observed=False).source)
     return np.asarray(alg.matrix_from_symmetric(jnp.asarray(surface.covariance.T)))
 
 
@@ -234,8 +221,9 @@ def surface_table(
     cloud: PointCloud, method: AbstractMethod, kinds: Kinds, with_geometry: bool, observed: bool
 ) -> ComputedTable:
     """The surface of a concrete cloud, with `noise` if `observed`, whose rows are cached with the cloud."""
-    geometry = geometry_table(cloud, method.uses_channels) if with_geometry else None
-    return _table(cloud, method, kinds, geometry, observed)
+    geometry = geo.geometry_table(cloud, method.uses_channels) if with_geometry else None
+    inputs = _inputs(method, cloud, with_geometry, geometry)
+    return ComputedTable(surface_of(kinds, observed, with_geometry), method, inputs, cloud.points.shape[0])
 
 
 def differentiable_inputs(
@@ -256,32 +244,18 @@ def differentiable_inputs(
     fixed_source, fixed_target, fixed_method = fixed
     sides = ((source, fixed_source, source_rows), (target, fixed_target, indices))
     with_geometry = observed or all(cloud.deferred_neighbors is not None for cloud in (source, target))
-    inputs, kinds = [], kinds_of(terms)
+    matched, kinds = [], tuple(type(term) for term in terms if term.name)
+    function = surface_of(kinds, observed, with_geometry)
     for cloud, same, rows in sides:
-        geometry = differentiable_geometry(cloud, same, method.uses_channels) if with_geometry else None
+        geometry = geo.differentiable_geometry(cloud, same, method.uses_channels) if with_geometry else None
+        inputs = _inputs(method, cloud, with_geometry, geometry)
         values = surface_table(same, fixed_method, kinds, with_geometry, observed)
-        inputs.append(Input(_table(cloud, method, kinds, geometry, observed, values), rows))
+        matched.append(Input(ComputedTable(function, method, inputs, values.size, values), rows))
     if soft:
         for cloud, _, rows in sides:
             points = Input(PointRows(cloud.points, cloud.channels, cloud.channel_valid))
-            inputs.append(Input(ComputedTable(_descriptors, method, [points], cloud.points.shape[0]), rows))
-    return inputs
-
-
-def _table(
-    cloud: PointCloud,
-    method: AbstractMethod,
-    kinds: Kinds,
-    geometry: ComputedTable | None,
-    observed: bool,
-    values: ComputedTable | None = None,
-) -> ComputedTable:
-    with_geometry = geometry is not None
-    inputs = _inputs(method, cloud, with_geometry)
-    if geometry is not None:
-        inputs += [Input(geometry), Input(geometry, part=1)]
-    function = _surface_rows(kinds, observed, with_geometry)
-    return ComputedTable(function, method, inputs, cloud.points.shape[0], values)
+            matched.append(Input(ComputedTable(_descriptors, method, [points], cloud.points.shape[0]), rows))
+    return matched
 
 
 def _descriptors(method: AbstractMethod, own: Rows) -> tuple[SearchPoints]:
@@ -298,48 +272,49 @@ def _surface_in(parts: tuple[Any, ...], search: SearchPoints) -> Surface:
     return surface._replace(noise=noise[0] if noise else None, search=search)
 
 
-def _inputs(method: AbstractMethod, cloud: PointCloud, with_geometry: bool) -> list[Input]:
+def _inputs(
+    method: AbstractMethod, cloud: PointCloud, with_geometry: bool, geometry: ComputedTable | None = None
+) -> list[Input]:
+    """Inputs of the row function `surface_of`: the cloud, and its geometry if a table of it is passed."""
     if method.uses_neighborhoods and with_geometry:
-        return with_near(cloud, method.uses_channels, with_given=True)
-    return [Input(PointRows(cloud.points, given=cloud.covariances))]
+        inputs = with_near(cloud, method.uses_channels, with_given=True)
+    else:
+        inputs = [Input(PointRows(cloud.points, given=cloud.covariances))]
+    return inputs if geometry is None else [*inputs, Input(geometry), Input(geometry, part=1)]
 
 
 @cache
-def _surface_rows(kinds: Kinds, observed: bool, with_geometry: bool) -> Callable[..., Any]:
+def surface_of(kinds: Kinds, observed: bool, with_geometry: bool) -> Callable[..., Any]:
+    """The row function of surfaces without `search`; their `noise` is the second tree if `observed`. See
+    `AbstractMethod.covariance` and `surface_pair`."""
+
     def surface(method: AbstractMethod, own: Rows, *rest: Rows) -> tuple[Any, ...]:
-        near, local = (rest[:-2], joined(*(part.tree for part in rest[-2:]))) if with_geometry else (rest, None)
-        result = surface_of(method, kinds, neighborhoods(own, *near), local, observed)
-        return (result,) if result.noise is None else (result._replace(noise=None), result.noise)
+        near, local = (rest[:-2], geo.joined(*(part.tree for part in rest[-2:]))) if with_geometry else (rest, None)
+        around = neighborhoods(own, *near)
+        covariance = around.given_covariance
+        if local is not None and method.needs_covariances and covariance is not None:
+            local = geo.geometry_of_cells(local, covariance, method.num_candidates)
+        result = Surface(
+            points=jnp.asarray(around.own).T,
+            covariance=method.covariance(around, local).T,
+            observability=None,
+            channel_observability=None,
+            columns={kind.name: kind.columns(around, local) for kind in kinds},
+        )
+        if not observed or local is None:
+            return (result,)
+        by_channels, slopes, noise = None, None, jnp.zeros_like(around.own[0])
+        if method.uses_channels and local.fits.residual.shape[1]:
+            weights = jax.lax.stop_gradient(method.weights(local.fits.residual.shape[1]))
+            weights = jnp.asarray(weights, around.own.dtype)
+            by_channels, slopes, noise = channel_observability(local.fits, local.normal, weights)
+            by_channels = by_channels.T
+            if method.needs_covariances:
+                # Slopes between cells are not those between points.
+                slopes = None
+        details = geo.SurfaceNoise(noise, local.normal, local.roughness, local.neighborhood_radius, slopes)
+        # Observability is constant to autodiff.
+        by_shape, by_channels, details = jax.lax.stop_gradient((local.observability, by_channels, details))
+        return result._replace(observability=by_shape, channel_observability=by_channels), details
 
     return surface
-
-
-def surface_of(
-    method: AbstractMethod, kinds: Kinds, around: Neighborhoods, local: LocalGeometry | None, observed: bool
-) -> Surface:
-    """The surface at n points, without `search`; see `AbstractMethod.covariance` and `surface_pair`."""
-    given = around.given_covariance
-    if local is not None and method.needs_covariances and given is not None:
-        local = geometry_of_cells(local, given, method.num_candidates)
-    surface = Surface(
-        points=jnp.asarray(around.own).T,
-        covariance=method.covariance(around, local).T,
-        observability=None,
-        channel_observability=None,
-        columns={kind.name: kind.columns(around, local) for kind in kinds},
-    )
-    if not observed or local is None:
-        return surface
-    by_channels, slopes, noise = None, None, jnp.zeros_like(around.own[0])
-    if method.uses_channels and local.fits.residual.shape[1]:
-        weights = jax.lax.stop_gradient(method.weights(local.fits.residual.shape[1]))
-        weights = jnp.asarray(weights, around.own.dtype)
-        by_channels, slopes, noise = channel_observability(local.fits, local.normal, weights)
-        by_channels = by_channels.T
-        if method.needs_covariances:
-            # Slopes between cells are not those between points.
-            slopes = None
-    # Observability is constant to autodiff.
-    details = SurfaceNoise(noise, local.normal, local.roughness, local.neighborhood_radius, slopes)
-    by_shape, by_channels, details = jax.lax.stop_gradient((local.observability, by_channels, details))
-    return surface._replace(observability=by_shape, channel_observability=by_channels, noise=details)
