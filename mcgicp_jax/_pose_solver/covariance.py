@@ -64,21 +64,18 @@ class NoiseSample(NamedTuple):
 
 def noise_sample(motion: Motion, matched: Matched) -> NoiseSample:
     """The statistics of matches whose surfaces have `noise` and `search`."""
-    source, target = matched.source, matched.target
-    noises = cast(SurfaceNoise, source.noise), cast(SurfaceNoise, target.noise)
-    rows = searched(source), searched(target)
-    residual = target.points.T - motion.move(source.points)
-    across = jnp.dot(motion.rotation, noises[0].normal.T, precision="highest")
-    expected = noises[0].roughness + noises[1].roughness
-    noise = noises[0].descriptors + noises[1].descriptors
-    difference = rows[0].descriptors - rows[1].descriptors
+    source, target = cast(SurfaceNoise, matched.source.noise), cast(SurfaceNoise, matched.target.noise)
+    residual = matched.target.points.T - motion.move(matched.source.points)
+    normal = jnp.dot(motion.rotation, source.normal.T, precision="highest")
+    rows, rows_there = searched(matched.source), searched(matched.target)
+    difference, variance = rows.descriptors - rows_there.descriptors, source.descriptors + target.descriptors
     # A quotient per match rather than one of medians: noise is higher at edges.
-    quotient = jnp.sum(difference * difference, axis=1) / jnp.where(noise > 0, noise, jnp.nan)
-    for side in rows:
-        if side.penalty is not None:
-            quotient = jnp.where(jnp.all(side.penalty == 0, axis=1), quotient, jnp.nan)
-    radius = 0.5 * (noises[0].neighborhood_radius + noises[1].neighborhood_radius)
-    columns = alg.inner(across, residual) ** 2, expected, quotient, radius
+    quotient = jnp.sum(difference * difference, axis=1) / jnp.where(variance > 0, variance, jnp.nan)
+    for penalty in (rows.penalty, rows_there.penalty):
+        if penalty is not None:
+            quotient = jnp.where(jnp.all(penalty == 0, axis=1), quotient, jnp.nan)
+    radius = 0.5 * (source.neighborhood_radius + target.neighborhood_radius)
+    columns = alg.inner(normal, residual) ** 2, source.roughness + target.roughness, quotient, radius
     return NoiseSample(*(jnp.where(matched.valid, column, jnp.nan) for column in columns))
 
 
@@ -97,8 +94,8 @@ def discounts_and_radius(
     `num_channels` is that of channels with a nonzero weight α.
     """
     xp = numpy_for(sample, num_channels)
-    seen, expected, quotient, neighborhood_radius = median(xp.stack([xp.asarray(column) for column in sample]))
-    geometry = (seen / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
+    residual, expected, quotient, neighborhood_radius = median(xp.stack([xp.asarray(column) for column in sample]))
+    geometry = (residual / _MEDIAN_SQUARE) / (xp.where(expected > 0, expected, xp.nan) / _MEDIAN_MEAN_OF_TWO)
     # Divided by the median of χ²/C with C degrees of freedom, after Wilson & Hilferty 1931.
     channels = quotient / (1 - 2 / (9 * xp.maximum(num_channels, 1))) ** 3
     ratios = xp.stack([geometry, channels])
@@ -161,23 +158,23 @@ def scores_of(
         cell = jnp.floor(jnp.where(matched.valid, arms * per_radius / 2.0**level, 0)).astype(jnp.int32)
         cells = cell_numbers((*cell, level.astype(jnp.int32)), frame.num_cells)
     if responding is not None:
-        seen = linearize_at(motion, matched, responding)[1]
-        stiffness, bias = seen.stiffness, jnp.sum(_wrench(arms, total.force - seen.force), axis=1)
+        response = linearize_at(motion, matched, responding)[1]
+        stiffness, bias = response.stiffness, jnp.sum(_wrench(arms, total.force - response.force), axis=1)
     else:
         if any(term.robust is not None for term in terms):
             # The symmetric part of −∂f/∂(T a), which includes the decrease of w with the residual.
             def force_at(shift: Float[Array, "3"]) -> Float[Array, "3 N"]:
                 return linearize(terms, posed._replace(moved=moved + shift[:, None])).force
 
-            still = jnp.zeros(3, moved.dtype)
-            columns = [-counts * jax.jvp(force_at, (still,), (axis,))[1] for axis in jnp.eye(3, dtype=still.dtype)]
+            zero = jnp.zeros(3, moved.dtype)
+            columns = [-counts * jax.jvp(force_at, (zero,), (axis,))[1] for axis in jnp.eye(3, dtype=zero.dtype)]
             stiffness = jnp.stack([0.5 * (columns[j][i] + columns[i][j]) for i in range(3) for j in range(i, 3)])
         if matched.source.noise is not None:
-            shown = _discounted_observability(posed, frame.discount, terms)
-            left_out = total.force - alg.multiply(total.stiffness, alg.multiply(shown, total.residual))
-            bias = jnp.sum(_wrench(arms, left_out), axis=1)
+            observable = _discounted_observability(posed, frame.discount, terms)
+            observed_force = alg.multiply(total.stiffness, alg.multiply(observable, total.residual))
+            bias = jnp.sum(_wrench(arms, total.force - observed_force), axis=1)
             if all(term.matches_slide for term in terms):
-                stiffness = alg.symmetric_product(stiffness, shown)
+                stiffness = alg.symmetric_product(stiffness, observable)
     jacobian = moments_about(stiffness, with_one(arms * frame.radius))
     return Scores(_wrench(arms, total.force).T, matched.valid.astype(moved.dtype), cells, jacobian, bias)
 
@@ -188,7 +185,7 @@ def _discounted_observability(
     fractions = observability(posed, terms, np.bool_(True))
     # Of cells alone the mean is biased, see `observability`.
     slide = all(term.matches_slide for term in terms)
-    shown = discount[0] * fractions["observability" if slide else "common"]
+    observable = discount[0] * fractions["observability" if slide else "common"]
     channels = fractions.get("channel_observability")
     if channels is not None:
         # Their agreement is unbiased only for matches that are nearest in position.
@@ -196,8 +193,8 @@ def _discounted_observability(
             channels = fractions.get("agreement", channels)
         # A / (1 + tr A) with A multiplied by the discount.
         trace = channels[0] + channels[3] + channels[5]
-        shown = shown + discount[1] * channels / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
-    return shown
+        observable = observable + discount[1] * channels / (1 - (1 - discount[1]) * jnp.clip(trace, 0, 1))
+    return observable
 
 
 def _wrench(arms: Float[Array, "3 N"], force: Float[Array, "3 N"]) -> Float[Array, "6 N"]:
@@ -225,8 +222,7 @@ def moments_from(scores: Scores, num_cells: int) -> Moments:
     xp = numpy_for(scores)
     rows = xp.concatenate([scores.wrenches, scores.valid[:, None]], axis=1)
     if scores.cells is not None and xp is np:
-        columns = [np.bincount(scores.cells, column, num_cells) for column in rows.T]
-        rows = np.stack(columns, axis=1)
+        rows = np.stack([np.bincount(scores.cells, column, num_cells) for column in rows.T], axis=1)
     elif scores.cells is not None:
         # Row-major, so that one scatter adds seven numbers. Rows out of bounds, which do not count, are left out: GPUs
         # would add all of them to the same cell, one after the other.

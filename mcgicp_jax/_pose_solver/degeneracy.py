@@ -7,7 +7,7 @@ units of the radius of the matched points (`Sums.radius`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -120,39 +120,32 @@ def find_directions(sums: Sums, constraints: Float[Array, "6 6"] | None = None) 
         fixed = jnp.arange(6) >= 6 - jnp.sum(sizes > 0)
         ties = jnp.where(fixed, jnp.inf, 0)
     # 2 and 3, above any fraction, sort the other directions last.
-    seen = jnp.where(jnp.outer(~fixed, ~fixed), basis.T @ geometry @ basis, jnp.diag(2.0 * fixed))
-    basis = basis @ jnp.linalg.eigh(seen)[1]
+    moving = jnp.outer(~fixed, ~fixed)
+    basis = basis @ jnp.linalg.eigh(jnp.where(moving, basis.T @ geometry @ basis, jnp.diag(2.0 * fixed)))[1]
     # The directions stay those along which the pose was updated; geometry constrains what both clouds observe.
-    shares = jnp.minimum(_along(basis, geometry), _along(basis, common))
-    if sums.channel_observability is None or sums.agreement is None or sums.surplus is None:
-        channels = jnp.zeros_like(shares)
-        return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
-    # Diagonalise the channels within the free directions.
-    free = ~(shares >= LEAST_BY_GEOMETRY) & ~fixed
-    among = jnp.outer(free, free)
-    within = twist_form(sums.channel_observability / total, radius)
-    seen, turn = jnp.linalg.eigh(jnp.where(among, basis.T @ within @ basis, jnp.diag(2.0 * ~free + fixed)))
-    basis = basis @ turn
-    forms = geometry, common, *(twist_form(moments / total, radius) for moments in (sums.agreement, sums.surplus))
-    by_mean, by_common, agreed, surplus = (_along(basis, form) for form in forms)
-    shares = jnp.minimum(by_mean, by_common)
-    agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
-    channels = jnp.where((seen > 0) & (agreed < _AGREE * seen), agreed - _AGREE * seen, seen)
-    channels = jnp.where(seen > 1.5, 0, channels)
-    return Directions(twists=basis.T, geometry=shares, channels=channels, center=center, radius=radius, ties=ties)
-
-
-def _along(basis: Float[Array, "6 6"], form: Float[Array, "6 6"]) -> Float[Array, "6"]:
-    """bᵀ F b for each column b of the basis."""
-    return jnp.sum(basis * (form @ basis), axis=0)
+    # bᵀ F b for each column b of the basis and both forms F.
+    by_geometry = jnp.minimum(*(jnp.sum(basis * (form @ basis), axis=0) for form in (geometry, common)))
+    channels = jnp.zeros_like(by_geometry)
+    if sums.channel_observability is not None and sums.agreement is not None and sums.surplus is not None:
+        # Diagonalise the channels within the free directions.
+        free = ~(by_geometry >= LEAST_BY_GEOMETRY) & ~fixed
+        within = basis.T @ twist_form(sums.channel_observability / total, radius) @ basis
+        observed, turn = jnp.linalg.eigh(jnp.where(jnp.outer(free, free), within, jnp.diag(2.0 * ~free + fixed)))
+        basis = basis @ turn
+        forms = geometry, common, *(twist_form(moments / total, radius) for moments in (sums.agreement, sums.surplus))
+        by_mean, by_common, agreed, surplus = (jnp.sum(basis * (form @ basis), axis=0) for form in forms)
+        by_geometry = jnp.minimum(by_mean, by_common)
+        agreed = jnp.where(surplus < _PATTERN * agreed, 0, agreed)
+        channels = jnp.where((observed > 0) & (agreed < _AGREE * observed), agreed - _AGREE * observed, observed)
+        channels = jnp.where(observed > 1.5, 0, channels)
+    return Directions(basis.T, by_geometry, channels, center, radius, ties)
 
 
 def directions_at_source(directions: Directions, pose: jaxlie.SE3) -> Directions:
     """The directions as twists ξ of T exp(ξ), metres and radians, that move the matched points by 1 m (rms)."""
     center, radius = jnp.asarray(directions.center), jnp.asarray(directions.radius)
     change = adjoint_to_source(pose, center) * units(radius) / radius
-    center = pose.inverse() @ center
-    return eqx.tree_at(lambda d: (d.twists, d.center), directions, (directions.twists @ change.T, center))
+    return replace(directions, twists=directions.twists @ change.T, center=pose.inverse() @ center)
 
 
 @dataclass(frozen=True, eq=False)

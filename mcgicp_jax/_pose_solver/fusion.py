@@ -30,8 +30,7 @@ def constrained_by_pose_form(directions: Directions, information: Float[Array, "
     free = ~(jnp.asarray(directions.constrained_by_matches) | fixed)
     information = basis.T @ information @ basis
     stiffness = jnp.where(jnp.outer(free, free), information, 0)
-    total = jnp.trace(stiffness)
-    scale = jnp.where(total > 0, total, 1)
+    scale = jnp.where(jnp.trace(stiffness) > 0, jnp.trace(stiffness), 1)
     # −1 and −2 sort the other directions first.
     values, turn = jnp.linalg.eigh(stiffness / scale + jnp.diag(-1.0 * ~free - fixed))
     squares = turn.T**2
@@ -51,8 +50,7 @@ def fuse(
     pose: jaxlie.SE3, center: Float[Array, "3"], directions: Directions, moments: Moments, form: PoseForm
 ) -> Fusion:
     """Equation of the pose from the end of a first registration; `form` refers to pose and center."""
-    radius = jnp.asarray(directions.radius)
-    motion = Motion.of(pose.wxyz_xyz)
+    radius, motion = jnp.asarray(directions.radius), Motion.of(pose.wxyz_xyz)
     measurements = PoseMeasurements(*motion, center, radius, form)
     directions = constrained_by_pose_form(directions, measurements.force_and_stiffness(motion)[1])
     basis, by_matches = jnp.asarray(directions.twists).T, jnp.asarray(directions.constrained_by_matches)
@@ -71,13 +69,6 @@ def fuse(
     return Fusion(*motion, center, radius, form, basis, gain, information, directions.constrained, fixed)
 
 
-def _to_sums(fusion: PoseMeasurements, sums: Sums) -> tuple[Float[Array, "6 6"], Float[Array, "6 6"]]:
-    """Matrices from twists about the centre of `fusion` to those about the centre of the sums, and back."""
-    offset, lengths, lengths_here = sums.center - fusion.center, units(fusion.radius), units(sums.radius)
-    outwards = translation_adjoint(-offset).astype(offset.dtype) * lengths / lengths_here[:, None]
-    return outwards, translation_adjoint(offset).astype(offset.dtype) * lengths_here / lengths[:, None]
-
-
 def first_force(
     pose: jaxlie.SE3, sums: Sums, directions: Directions, measurements: PoseMeasurements
 ) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
@@ -89,7 +80,9 @@ def first_force(
     at which the weights of a `Fusion` are estimated depends on those alone that are far more precise than the matches.
     """
     force, stiffness = measurements.force_and_stiffness(Motion.of(pose.wxyz_xyz))
-    _, back = _to_sums(measurements, sums)
+    # Twists about the centre of the measurements, from those about the centre of the sums.
+    adjoint = translation_adjoint(sums.center - measurements.center).astype(sums.center.dtype)
+    back = adjoint * units(sums.radius) / units(measurements.radius)[:, None]
     basis, constrained = jnp.asarray(directions.twists).T, jnp.asarray(directions.constrained_by_matches)
     along, weight = back @ basis, _FIRST_WEIGHT * sums.cost / jnp.maximum(sums.count, 1) / sums.radius**2
     both = jnp.outer(constrained, constrained)
@@ -108,7 +101,10 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     """One Newton step on P s + γ = 0, with the matches and M fixed; and the directions with tie points and prior."""
     radius, motion = fusion.radius, Motion.of(pose.wxyz_xyz)
     pose_force, pose_stiffness = fusion.force_and_stiffness(motion)
-    outwards, back = _to_sums(fusion, sums)
+    # To twists about the centre of the sums, and back.
+    offset, lengths, lengths_at_sums = sums.center - fusion.center, units(radius), units(sums.radius)
+    outwards = translation_adjoint(-offset).astype(offset.dtype) * lengths / lengths_at_sums[:, None]
+    back = translation_adjoint(offset).astype(offset.dtype) * lengths_at_sums / lengths[:, None]
     centred_stiffness = back.T @ pose_stiffness @ back
     directions = constrained_by_pose_form(directions, centred_stiffness)
     unit_information = twist_form(sums.stiffness, sums.radius)
@@ -118,7 +114,8 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     stiffness = outwards.T @ (unit_information * sums.radius**2) @ outwards / radius
     # The solution waits for the eigenvectors of the directions: two batched LAPACK calls at once can deadlock.
     rotation, _ = jax.lax.optimization_barrier((motion.rotation, directions.twists))
-    basis, free = fusion.twists_at(motion._replace(rotation=rotation)), fusion.free
+    basis = fusion.twists_at(motion._replace(rotation=rotation))
+    free = fusion.constrained if fusion.fixed is None else fusion.constrained & ~fusion.fixed
     slope = fusion.gain @ basis.T @ stiffness @ basis + basis.T @ pose_stiffness @ basis
     force = fusion.gain @ (basis.T @ score) + basis.T @ pose_force
     slope = jnp.where(jnp.outer(free, free), slope, jnp.diag(1.0 * ~free))
@@ -127,11 +124,8 @@ def fused_update(pose: jaxlie.SE3, sums: Sums, directions: Directions, fusion: F
     count = jnp.sum(fusion.information.diagonal() > 0)
     mean = jnp.trace(fusion.gain) / jnp.maximum(count, 1)
     unit = radius / jnp.where(mean > 0, mean, 1) / sums.radius**2
-    return directions, Update(
-        twist=twist * units(sums.radius),
-        information=unit_information + unit * centred_stiffness,
-        degenerate=~jnp.all(fusion.constrained),
-    )
+    information = unit_information + unit * centred_stiffness
+    return directions, Update(twist * lengths_at_sums, information, ~jnp.all(fusion.constrained))
 
 
 @jax.jit

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -98,12 +99,13 @@ def _with_derivative_jvp(
         return _balance(jnp.zeros_like(at_root[:6]), at_root, root, jax.tree.unflatten(structure, changed))
 
     _, change = jax.jvp(balance_of, ([leaves[i] for i in moving],), ([slopes[i] for i in moving],))
-    return pose, _along(start, -inverse @ change * units(root.radius), root.center)
+    return pose, _along(start, -inverse @ change, root)
 
 
-def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], center: Float[Array, "3"]) -> Float[Array, "7"]:
-    """First-order change of the pose parameters `wxyz_xyz` along a twist about a centre; linear in the twist."""
-    return jnp.matmul(parameters_by_twist(pose, center).astype(pose.dtype), twist, precision="highest")
+def _along(pose: Float[Array, "7"], twist: Float[Array, "6"], root: ImplicitRoot) -> Float[Array, "7"]:
+    """First-order change of the pose parameters `wxyz_xyz` along a twist (in units of the radius); linear in it."""
+    slope = parameters_by_twist(pose, root.center).astype(pose.dtype)
+    return jnp.matmul(slope, twist * units(root.radius), precision="highest")
 
 
 def _newton(
@@ -111,18 +113,16 @@ def _newton(
 ) -> tuple[Float[Array, "7"], Float[Array, "6 6"]]:
     """The root near a pose, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ before the last step; that pose and 0 if the method diverged."""
     small = jnp.sqrt(float(jnp.finfo(start.dtype).eps))
-    identity = jnp.eye(6, dtype=start.dtype)
+    still, identity = jnp.zeros_like(start[:6]), jnp.eye(6, dtype=start.dtype)
 
     def step(carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         count, pose, _, _ = carry
-        balance, jacobian = value_and_jacobian(
-            lambda twist: _balance(twist, pose, root, model), jnp.zeros_like(pose[:6])
-        )
+        balance, jacobian = value_and_jacobian(lambda twist: _balance(twist, pose, root, model), still)
         jacobian = jnp.where(root.usable, jacobian, identity)
         inverse = root.columns @ jnp.linalg.inv(root.within(jacobian)) @ root.rows
         twist = jnp.where(root.usable, -inverse @ balance, 0)
         size = jnp.max(jnp.abs(twist))
-        moved = pose + _along(pose, twist * units(root.radius), root.center)
+        moved = pose + _along(pose, twist, root)
         moved = moved.at[:4].divide(jnp.sqrt(jnp.sum(moved[:4] ** 2)))
         # Reverse mode multiplies by what follows from pose and inverse, so that they must never be NaN.
         moved = jnp.where((size <= small) | (count + 1 < MAX_NEWTON_STEPS), moved, start)
@@ -133,8 +133,8 @@ def _newton(
         # Convergence is quadratic: after a step below √eps the remaining error is rounding.
         return (count < MAX_NEWTON_STEPS) & ~(size <= small)
 
-    before = jnp.int32(0), start, identity, jnp.asarray(jnp.inf, start.dtype)
-    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, before)
+    initial = jnp.int32(0), start, identity, jnp.asarray(jnp.inf, start.dtype)
+    _, at_root, inverse, size = jax.lax.while_loop(unfinished, step, initial)
     return at_root, jnp.where(root.usable & (size <= small), inverse, 0)
 
 
@@ -148,10 +148,9 @@ def value_and_jacobian(
 
 def _balance(twist: Float[Array, "6"], pose: Float[Array, "7"], root: ImplicitRoot, model: Model) -> Float[Array, "6"]:
     """`score_at`, or `Fusion.balance`, at a pose `moved_along` a twist."""
-    matched, terms, fusion = model
     motion = moved_along(twist, pose, root)
-    score = score_at(motion, root, matched, terms)
-    return score if fusion is None else fusion.balance(score, motion)
+    score = score_at(motion, root, model.matched, model.terms)
+    return score if model.fusion is None else model.fusion.balance(score, motion)
 
 
 def score_at(
@@ -159,7 +158,7 @@ def score_at(
 ) -> Float[Array, "6"]:
     """g / scale, sums of forces and torques."""
     # Without a usable root, ignoring all correspondences keeps values and derivatives finite.
-    matched = eqx.tree_at(lambda matched: matched.valid, matched, matched.valid & root.usable)
+    matched = replace(matched, valid=matched.valid & root.usable)
     posed, total, _ = linearize_at(motion, matched, terms)
     arms = jnp.where(matched.valid, posed.moved - root.center[:, None], 0)
     torque = jnp.cross(arms, total.force, axis=0)

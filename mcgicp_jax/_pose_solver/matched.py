@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -108,10 +109,6 @@ class Matched(eqx.Module):
         moved = motion.move(self.source.points)
         return PosedMatches(self.source, self.target, moved, motion.rotation, self.valid)
 
-    def within(self, motion: Motion, max_distance: Float[Array, ""]) -> Matched:
-        _, near = distances_within(motion.move(self.source.points), self.target.points, max_distance)
-        return eqx.tree_at(lambda matched: matched.valid, self, self.valid & near)
-
 
 def match_surfaces(source: Surface, target: Surface, matches: Matches) -> Matched:
     """Gather the matched rows of both surfaces, for their derivative; pure JAX."""
@@ -141,7 +138,9 @@ def of_matches(function: Callable[..., Any], total: bool = True) -> Callable[...
 
     def of_rows(numbers: tuple[Motion, Any, Any, tuple[Any, ...]], *rows: Rows) -> Any:
         motion, max_distance, temperature, arguments = numbers
-        result = function(motion, matched_rows(rows, temperature).within(motion, max_distance), *arguments)
+        matched = matched_rows(rows, temperature)
+        _, near = distances_within(motion.move(matched.source.points), matched.target.points, max_distance)
+        result = function(motion, replace(matched, valid=matched.valid & near), *arguments)
         return result if total else (result,)
 
     of_rows.__name__ = function.__name__
@@ -153,9 +152,8 @@ def matched_rows(rows: Sequence[Rows], temperature: Float[AnyScalar, ""] | None 
     index = rows[1].index
     count = len(index) if index.ndim == 2 else 1
     # Each source point once for each of its candidates.
-    repeated = [part.tree for part in rows[::2]]
+    repeated, candidates = [part.tree for part in rows[::2]], [part.tree for part in rows[1::2]]
     repeated = jax.tree.map(lambda leaf: jnp.tile(leaf, (count, *[1] * (leaf.ndim - 1))), repeated)
-    candidates = [part.tree for part in rows[1::2]]
     candidates = jax.tree.map(lambda leaf: leaf.reshape(index.size, *leaf.shape[index.ndim :]), candidates)
     source, target = (
         surface._replace(**{"noise" if isinstance(part, SurfaceNoise) else "search": part for part in parts})
@@ -215,14 +213,14 @@ def adapted(
     xp = numpy_for(counts, valid)
     fraction = xp.sum(counts) / xp.maximum(xp.sum(valid), 1)
 
-    def only(column: Float[AnyArray, "n *_"]) -> Float[AnyArray, "n *_"]:
-        missing = np.asarray(np.nan, column.dtype)
-        return numpy_for(column, counts).where(counts.reshape(-1, *[1] * (column.ndim - 1)), column, missing)
+    def without_padding(column: Float[AnyArray, "n *_"]) -> Float[AnyArray, "n *_"]:
+        mask = counts.reshape(-1, *[1] * (column.ndim - 1))
+        return numpy_for(column, counts).where(mask, column, np.asarray(np.nan, column.dtype))
 
     # Huge coordinates or channels lead to the status NON_FINITE; NumPy need not warn of them.
     with np.errstate(over="ignore", invalid="ignore"):
         return tuple(
-            constant(term.adapt(jax.tree.map(only, sample(term, rows)), fraction))
+            constant(term.adapt(jax.tree.map(without_padding, sample(term, rows)), fraction))
             if isinstance(term, AbstractAdaptiveTerm)
             else term
             for term in terms

@@ -124,19 +124,15 @@ class PoseMeasurements(eqx.Module):
     radius: Float[AnyScalar, ""]
     form: PoseForm
 
-    def _change(self, motion: Motion) -> Motion:
-        """ΔR and Δt of a pose, metres."""
+    def _change(self, motion: Motion) -> tuple[Float[Array, "3 4"], Float[Array, "3"]]:
+        """[ΔR | Δt] of a pose, Δt in units of the radius; and Δt in metres."""
         turn = motion.rotation @ self.rotation.T
-        return Motion(turn, motion.translation - self.center - turn @ (self.translation - self.center))
-
-    def _now(self, motion: Motion) -> Float[Array, "3 4"]:
-        """[ΔR | Δt] of a pose, Δt in units of the radius."""
-        turn, shift = self._change(motion)
-        return jnp.concatenate([turn, shift[:, None] / self.radius], axis=1)
+        shift = motion.translation - self.center - turn @ (self.translation - self.center)
+        return jnp.concatenate([turn, shift[:, None] / self.radius], axis=1), shift
 
     def prior_residual(self, motion: Motion) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """ξ at a pose, and its derivative by each of six twists, one per row."""
-        shift = self._change(motion).translation
+        _, shift = self._change(motion)
         prior, dtype = self.form.prior, shift.dtype
 
         def residual_at(twist: Float[Array, "6"]) -> Float[Array, "6"]:
@@ -152,12 +148,12 @@ class PoseMeasurements(eqx.Module):
 
     def cost_of_ties(self, motion: Motion) -> Float[Array, ""]:
         """Cost of the tie points at a pose, squared standard deviations."""
-        change, form = (self._now(motion) - jnp.eye(3, 4, dtype=self.center.dtype)).reshape(12), self.form
+        change, form = (self._change(motion)[0] - jnp.eye(3, 4, dtype=self.center.dtype)).reshape(12), self.form
         return form.energy - 2 * form.force @ change + change @ form.stiffness @ change
 
     def force_and_stiffness(self, motion: Motion) -> tuple[Float[Array, "6"], Float[Array, "6 6"]]:
         """γ, and its stiffness JᵀQJ, at a pose."""
-        now = self._now(motion)
+        now, _ = self._change(motion)
         axes = jnp.eye(3, dtype=now.dtype)
         along = jnp.concatenate([jnp.zeros((3, 3, 3), now.dtype), axes[:, :, None]], axis=2)
         about = jnp.cross(axes[:, :, None], now[None], axis=1)
@@ -194,11 +190,6 @@ class Fusion(PoseMeasurements):
     constrained: Bool[AnyArray, "6"]
     fixed: Bool[AnyArray, "6"] | None = None
 
-    @property
-    def free(self) -> Bool[AnyArray, "6"]:
-        """Which twists of the basis tie points, prior and matches determine together."""
-        return self.constrained if self.fixed is None else self.constrained & ~self.fixed
-
     def twists_at(self, motion: Motion) -> Float[AnyArray, "6 6"]:
         if self.fixed is None:
             return self.basis
@@ -206,13 +197,11 @@ class Fusion(PoseMeasurements):
 
     def balance(self, score: Float[Array, "6"], motion: Motion) -> Float[Array, "6"]:
         """P s + γ, in the basis; F ξ instead for fixed directions."""
-        force, _ = self.force_and_stiffness(motion)
         basis, fixed = self.twists_at(motion), self.form.prior.fixed
-        forces = self.gain @ (basis.T @ score) + basis.T @ force
+        forces = self.gain @ (basis.T @ score) + basis.T @ self.force_and_stiffness(motion)[0]
         if self.fixed is None or fixed is None:
             return forces
-        residual, _ = self.prior_residual(motion)
-        return jnp.where(self.fixed, (fixed @ self.basis).T @ (fixed @ residual), forces)
+        return jnp.where(self.fixed, (fixed @ self.basis).T @ (fixed @ self.prior_residual(motion)[0]), forces)
 
 
 def constraints_at(
@@ -226,11 +215,11 @@ def constraints_at(
 @jax.jit
 def with_fixed_directions(pose: jaxlie.SE3, prior: Prior) -> jaxlie.SE3:
     """The pose with ξ projected onto F ξ = 0."""
-    fixed = prior.fixed
-    twist = _pose_of(prior).inverse().multiply(pose).log()
+    fixed, prior_pose = prior.fixed, _pose_of(prior)
+    twist = prior_pose.inverse().multiply(pose).log()
     gram = fixed @ fixed.T + jnp.diag(1.0 * ~jnp.any(fixed != 0, axis=1))
     twist = twist - fixed.T @ (inverse_6(gram) @ (fixed @ twist))
-    moved = _pose_of(prior).multiply(jaxlie.SE3.exp(twist)).normalize()
+    moved = prior_pose.multiply(jaxlie.SE3.exp(twist)).normalize()
     # jaxlie promotes to the default precision.
     return jaxlie.SE3(moved.wxyz_xyz.astype(pose.wxyz_xyz.dtype))
 

@@ -111,26 +111,21 @@ def sums_of(
     *position, count = jnp.dot(with_one(posed.moved), mask, precision="highest")
     center = jnp.stack(position) / jnp.maximum(count, 1)
     h = with_one(mask * (posed.moved - center[:, None]))
-    share = normalized(counts.reshape(matched.num_candidates, -1))
+    weights = normalized(counts.reshape(matched.num_candidates, -1))
+    square_distances = weights * alg.inner(total.residual, total.residual)
     first = mask
     if matched.num_candidates > 1:
         # 1 for the first valid candidate of each source point.
         by_candidate = mask.reshape(matched.num_candidates, -1)
         first = jnp.where(jnp.cumsum(by_candidate, axis=0) == 1, by_candidate, 0).reshape(-1)
-    numbers = [
-        mask,
-        alg.inner(total.residual, total.force),
-        total.cost,
-        share * alg.inner(total.residual, total.residual),
-        first,
-    ]
-    rows = {"stiffness": total.stiffness, "force": total.force, "numbers": jnp.stack(numbers)}
+    numbers = jnp.stack([mask, alg.inner(total.residual, total.force), total.cost, square_distances, first])
+    rows = {"stiffness": total.stiffness, "force": total.force, "numbers": numbers}
     fractions = observability(posed, terms, last)
     if fractions:
         far = jnp.sum(jnp.square(jnp.asarray(posed.source.points)), axis=1) >= near**2
         evidence = jnp.where(far, total.weight, 0)
-        rows["mass"] = evidence[None]
         against = jnp.where(far, total.weight, -total.weight)
+        rows["mass"] = evidence[None]
         rows |= {name: against * fractions.pop(name) for name in ("observability", "common")}
         rows |= {name: evidence * fraction for name, fraction in fractions.items()}
     ends = np.cumsum([len(row) for row in rows.values()])
@@ -141,19 +136,10 @@ def sums_of(
     if "channel_observability" in moments:
         moments.setdefault("agreement", moments["channel_observability"])
         moments.setdefault("surplus", jnp.zeros_like(moments["channel_observability"]))
-    sums = moments.pop("numbers")
-    _, energy, cost, square_distance, num_matched = sums[:, 3, 3]
-    return Sums(
-        center=center,
-        count=count,
-        square_extent=jnp.trace(sums[0, :3, :3]),
-        energy=energy,
-        cost=cost,
-        square_distance=square_distance,
-        num_matched=num_matched,
-        force=moments.pop("force")[:, 3],
-        **moments,
-    )
+    numbers, force = moments.pop("numbers"), moments.pop("force")[:, 3]
+    square_extent = jnp.trace(numbers[0, :3, :3])
+    _, energy, cost, square_distance, num_matched = numbers[:, 3, 3]
+    return Sums(center, count, square_extent, energy, cost, square_distance, num_matched, force, **moments)
 
 
 def with_one(points: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
@@ -191,7 +177,7 @@ def observability(
     ours, theirs = alg.rotate(rotation, source.observability.T), target.observability.T
     mean, common = 0.5 * (ours + theirs), alg.symmetric_product(ours, theirs)
     if all(term.matches_slide for term in terms):
-        certain, certain_there = (jnp.clip(one[0] + one[3] + one[5], 0, 1) for one in (ours, theirs))
+        certain, certain_there = (jnp.clip(side[0] + side[3] + side[5], 0, 1) for side in (ours, theirs))
         common = common + mean - 0.5 * (certain_there * ours + certain * theirs)
     else:
         common = common - _BY_CHANCE * jnp.array([[1], [0], [0], [1], [0], [1]], ours.dtype)
@@ -199,15 +185,15 @@ def observability(
     if source.channel_observability is not None and target.channel_observability is not None:
         ours, theirs = alg.rotate(rotation, source.channel_observability.T), target.channel_observability.T
         fractions["channel_observability"] = 0.5 * (ours + theirs)
-    slopes = [None if surface.noise is None else surface.noise.slopes for surface in (source, target)]
-    if target.noise is not None and slopes[0] is not None and slopes[1] is not None:
-        turned = jnp.einsum("ij,ncj->cin", rotation, slopes[0], precision="highest")
+    slopes, slopes_there = (None if side.noise is None else side.noise.slopes for side in (source, target))
+    if target.noise is not None and slopes is not None and slopes_there is not None:
+        turned = jnp.einsum("ij,ncj->cin", rotation, slopes, precision="highest")
         # The source's sensor is at the origin of its frame; the target may be a map.
         sight = jnp.dot(rotation, source.points.T, precision="highest")
         tangent = jnp.cross(target.noise.normal.T, sight, axis=0)
         length = jnp.sqrt(alg.inner(tangent, tangent))
         across = tangent / jnp.where(length > 0, length, 1)
-        fractions["agreement"], fractions["surplus"] = agreement(turned, slopes[1].transpose(1, 2, 0), across)
+        fractions["agreement"], fractions["surplus"] = agreement(turned, slopes_there.transpose(1, 2, 0), across)
     return fractions
 
 
@@ -224,9 +210,8 @@ def combine(parts: Sums) -> Sums:
         columns["square_extent"] = parts.square_extent + parts.count * np.sum(offset * offset, axis=1)
         columns["force"] = parts.force @ shift.swapaxes(-1, -2)
         # All sums over h hᵀ at once.
-        names = [name for name in _SECOND_MOMENTS if name in columns]
-        rows = [columns[name].reshape(len(offset), -1, 4, 4) for name in names]
-        moved = shift[:, None] @ np.concatenate(rows, axis=1) @ shift[:, None].swapaxes(-1, -2)
-        parts_moved = np.split(moved, np.cumsum([part.shape[1] for part in rows])[:-1], axis=1)
-        columns |= {name: part.reshape(columns[name].shape) for name, part in zip(names, parts_moved, strict=True)}
+        rows = {name: columns[name].reshape(len(offset), -1, 4, 4) for name in _SECOND_MOMENTS if name in columns}
+        moved = shift[:, None] @ np.concatenate(list(rows.values()), axis=1) @ shift[:, None].swapaxes(-1, -2)
+        split = np.split(moved, np.cumsum([part.shape[1] for part in rows.values()])[:-1], axis=1)
+        columns |= {name: part.reshape(columns[name].shape) for name, part in zip(rows, split, strict=True)}
         return Sums(**{name: column.sum(axis=0) for name, column in columns.items()} | {"center": center})

@@ -47,9 +47,9 @@ def solve_update(
     """Minimise Σ w (d − D h)ᵀ M (d − D h) = e − 2⟨D, G⟩ + ⟨D, Q(D)⟩ (symbols as in `sums`) over the pose change D =
     [ΔR − I | Δt], with M and w fixed.
 
-    Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D, 1), so its time
-    does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts translation and rotation
-    on the same scale for clouds of any size.
+    Levenberg-Marquardt runs on 13 residuals, a square root of the (13, 13) quadratic form in (vec D, 1) divided by
+    radius², so its time does not depend on the number of points. Lengths are in units of `Sums.radius`, which puts
+    translation and rotation on the same scale for clouds of any size.
 
     Args:
         basis: (6, 6), columns: twists along which the pose may move, lengths in units of the radius. Zero columns
@@ -57,14 +57,14 @@ def solve_update(
         others: force and stiffness of other measurements of the pose, for its twist, lengths in units of the radius.
     """
     radius, dtype = sums.radius, sums.center.dtype
-    form = _quadratic_form(sums, radius)
+    quadratic = _unit_quadratic(sums.stiffness, radius)
+    linear = (sums.force * _unit_lengths(radius) / radius).reshape(12)
     if others is not None:
         force, stiffness = others
         # D is [ω× | v] to first order.
         twist = jnp.asarray(_TANGENT, dtype).T / jnp.asarray([1, 1, 1, 2, 2, 2], dtype)[:, None]
-        form = form + jnp.block(
-            [[twist.T @ stiffness @ twist, -(force @ twist)[:, None]], [-force @ twist, jnp.zeros(1, dtype)]]
-        )
+        quadratic, linear = quadratic + twist.T @ stiffness @ twist, linear + force @ twist
+    form = jnp.block([[quadratic, -linear[:, None]], [-linear, (sums.energy / radius**2)[None]]])
     unit_information = twist_form(sums.stiffness, radius)
     trace = jnp.trace(unit_information)
     scale = _HESSIAN_SCALE / jnp.where(trace > 0, trace / 6, 1)
@@ -76,9 +76,7 @@ def solve_update(
     # The residuals are sums of terms up to √_HESSIAN_SCALE = 100 and rounded accordingly: with a smaller tolerance the
     # steps would never fall below it.
     tolerance = 64 * float(jnp.finfo(root.dtype).eps)
-    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(
-        rtol=tolerance, atol=tolerance, linear_solver=_NormalEquations()
-    )
+    solver: optx.LevenbergMarquardt = optx.LevenbergMarquardt(tolerance, tolerance, linear_solver=_NormalEquations())
     solver = eqx.tree_at(lambda solver: solver.search, solver, _TrustRegion(solver.search))
     solution: optx.Solution = optx.least_squares(
         _residuals, solver, jnp.zeros(6), (root, columns), max_steps=_MAX_STEPS, throw=False
@@ -86,9 +84,8 @@ def solve_update(
     twist = basis @ solution.value.astype(dtype)
     # θ a from 2 s, see `_residuals`.
     square = 0.25 * (twist[3:] @ twist[3:])
-    turned = square > 0
-    tangent = jnp.sqrt(jnp.where(turned, square, 1))
-    turn = twist[3:] * jnp.where(turned, jnp.arctan(tangent) / tangent, 1)
+    tangent = jnp.sqrt(jnp.where(square > 0, square, 1))
+    turn = twist[3:] * jnp.where(square > 0, jnp.arctan(tangent) / tangent, 1)
     return Update(
         twist=jnp.concatenate([twist[:3] * radius, turn]),
         information=unit_information,
@@ -120,8 +117,7 @@ class _NormalEquations(lx.AbstractLinearSolver):
     def transpose(self, state: Any, options: dict[str, Any]) -> Any:
         raise NotImplementedError
 
-    def conj(self, state: Any, options: dict[str, Any]) -> Any:
-        raise NotImplementedError
+    conj = transpose
 
     def assume_full_rank(self) -> bool:
         return True
@@ -150,14 +146,6 @@ class _TrustRegion(optx.AbstractSearch):
         before = state.step_size, state
         size, after = jax.tree.map(partial(jnp.where, level & ~accept), before, (size, after))
         return size, accept | level, result, after
-
-
-def _quadratic_form(sums: Sums, radius: Float[Array, ""]) -> Float[Array, "13 13"]:
-    """The cost of `solve_update` as a form in (vec D, 1), divided by radius²; lengths in units of the radius."""
-    quadratic, lengths = _unit_quadratic(sums.stiffness, radius), _unit_lengths(radius)
-    linear = (sums.force * lengths / radius).reshape(12)
-    constant = sums.energy / radius**2
-    return jnp.block([[quadratic, -linear[:, None]], [-linear[None, :], constant[None, None]]])
 
 
 def _unit_quadratic(second: Float[Array, "6 4 4"], radius: Float[Array, ""]) -> Float[Array, "12 12"]:
