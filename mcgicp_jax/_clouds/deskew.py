@@ -57,7 +57,5 @@ def deskew(cloud: PointCloud, motion: Pose) -> PointCloud:
 
 
 def _shift(twist: Float[Array, "6"], points: Rows, times: Rows) -> tuple[Float[Array, "n 3"]]:
-    def moved(point: Float[Array, "3"], time: Float[Array, "1"]) -> Float[Array, "3"]:
-        return jaxlie.SE3.exp((time - 1) * twist) @ point - point
-
-    return (jax.vmap(moved)(points.tree, times.tree),)
+    shift = jax.vmap(lambda point, time: jaxlie.SE3.exp((time - 1) * twist) @ point - point)
+    return (shift(points.tree, times.tree),)

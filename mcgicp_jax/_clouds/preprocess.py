@@ -164,16 +164,14 @@ def with_neighbors(
     center = (0.5 * (low + high)).astype(np.float32).astype(np.float64)
     origin = center if is_far(center, float(np.linalg.norm(high - low))) else np.zeros(3)
     points = (points - origin).astype(dtype)
-    # Neighbours are searched among the rounded coordinates, which are those of the registration.
-    search = search or default_search()
-    neighbors = search.neighbors_on_demand(points, num_neighbors)
     arrays = {
         "points": points,
         "channels": np.asarray(cloud.channels, dtype),
         # Without missing channels the mask is None, so that all complete clouds share compiled programs.
         "channel_valid": None if channel_valid is None or np.all(channel_valid) else np.asarray(channel_valid),
         "valid": np.ones(len(points), bool),
-        "deferred_neighbors": neighbors,
+        # Searched among the rounded coordinates, which are those of the registration.
+        "deferred_neighbors": (search or default_search()).neighbors_on_demand(points, num_neighbors),
         "covariances": None if covariances is None else np.asarray(covariances, dtype),
         # Averages of points have no time: `deskew` comes first.
         "times": None,

@@ -93,9 +93,9 @@ def voxels_and_grids(
         raise ValueError(f"voxel_size: expected a number that is not traced, as voxels are constants, got {voxel_size}")
     if voxel_size != "auto":
         return Voxels(voxel_size), none
-    preprocessed = [cloud for cloud in clouds if cloud.voxel_size is not None]
-    if preprocessed:
-        return preprocessed[0].voxels, none
+    for cloud in clouds:
+        if cloud.voxel_size is not None:
+            return cloud.voxels, none
     if not is_concrete(primal(clouds)):
         # `preprocess` says what is expected.
         return Voxels(), none
