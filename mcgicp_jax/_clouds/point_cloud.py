@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import FrozenInstanceError, dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import equinox as eqx
 import jax
@@ -76,9 +76,10 @@ def _checked_times(times: Values) -> Any:
     return values
 
 
-def _checked_mask(channels: Any, channel_valid: Values | None, shape: tuple[int, ...]) -> Any:
-    """`channel_valid` in this shape, False also where `channels` is a masked array; None if nothing is missing."""
-    valid: Any = None
+def _masked(values: Any, channels: Any, channel_valid: Values | None) -> tuple[Any, Any]:
+    """The values of channels, 0 where they are missing (often NaN), so that these never enter arithmetic; and
+    `channel_valid` in their shape, False also where `channels` is a masked array, None if nothing is missing."""
+    shape, valid = np.shape(values), cast(Any, None)
     if channel_valid is not None:
         valid = channel_valid if isinstance(channel_valid, jax.Array) else np.ma.filled(channel_valid, False)
         if valid.dtype != bool:
@@ -87,16 +88,13 @@ def _checked_mask(channels: Any, channel_valid: Values | None, shape: tuple[int,
             valid = valid[..., None]
         if valid.shape != shape:
             raise ValueError(f"channel_valid: expected shape {shape} to go with channels, got {valid.shape}")
-    if not np.ma.is_masked(channels):
-        return valid
-    measured = ~np.ma.getmaskarray(channels).reshape(shape)
-    return measured if valid is None else measured & valid
-
-
-def _blank(channels: Any, channel_valid: Any) -> Any:
-    """Set missing channel values, often NaN, to 0, so that they never enter arithmetic."""
-    xp = np if isinstance(channels, np.ndarray) and isinstance(channel_valid, np.ndarray) else jnp
-    return xp.where(channel_valid, channels, 0)
+    if np.ma.is_masked(channels):
+        measured = ~np.ma.getmaskarray(channels).reshape(shape)
+        valid = measured if valid is None else measured & valid
+    if valid is None:
+        return values, None
+    xp = np if isinstance(values, np.ndarray) and isinstance(valid, np.ndarray) else jnp
+    return xp.where(valid, values, 0), valid
 
 
 @partial(register_dataclass, data_fields=(), meta_fields=(), drop_fields=("size", "reason"))
@@ -222,9 +220,7 @@ class PointCloud(eqx.Module):
             self.channels = self.channels[:, None]
         if self.channels.ndim != 2 or self.channels.shape[0] != size:
             raise ValueError(f"channels: expected shape ({size}, C) to go with points, got {self.channels.shape}")
-        self.channel_valid = _checked_mask(channels, channel_valid, np.shape(self.channels))
-        if self.channel_valid is not None:
-            self.channels = _blank(self.channels, self.channel_valid)
+        self.channels, self.channel_valid = _masked(self.channels, channels, channel_valid)
         self.covariances = None if covariances is None else _as_float("covariances", covariances)
         if self.covariances is not None and self.covariances.shape != (size, 3, 3):
             raise ValueError(f"covariances: expected shape ({size}, 3, 3), got {self.covariances.shape}")
@@ -316,7 +312,7 @@ class PointCloud(eqx.Module):
                 arrays[name] = array[..., None] if single else array
         if np.ma.is_masked(channels):
             valid = arrays.get("channel_valid", self.channel_valid)
-            arrays["channel_valid"] = _checked_mask(channels, valid, np.shape(arrays["channels"]))
+            _, arrays["channel_valid"] = _masked(arrays["channels"], channels, valid)
         for name, value in arrays.items():
             expected = shapes.get(name, np.shape(value))
             if np.shape(value) != expected and not (name in ("covariances", "times") and value is None):
@@ -332,8 +328,7 @@ class PointCloud(eqx.Module):
             fields["channel_names"] = _checked_names(arrays["channel_names"], fields["channels"].shape[-1])
         if fields["channel_valid"] is not None and arrays.keys() & {"channels", "channel_valid"}:
             channels = fields["channels"]
-            fields["channel_valid"] = _checked_mask(channels, fields["channel_valid"], np.shape(channels))
-            fields["channels"] = _blank(channels, fields["channel_valid"])
+            fields["channels"], fields["channel_valid"] = _masked(channels, channels, fields["channel_valid"])
         return self.replace_rows(**fields)
 
     @property

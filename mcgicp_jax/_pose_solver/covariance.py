@@ -29,7 +29,7 @@ from mcgicp_jax._math.poses import adjoint_to_source, units
 from mcgicp_jax._math.statistics import cell_numbers, median
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
-from mcgicp_jax._pose_solver.sums import moments_about, observability, with_one
+from mcgicp_jax._pose_solver.sums import moments_of, observability
 from mcgicp_jax._pose_solver.update import twist_form
 from mcgicp_jax._terms.base import AbstractTerm, PosedMatches, linearize
 
@@ -175,7 +175,7 @@ def scores_of(
             bias = jnp.sum(_wrench(arms, total.force - observed_force), axis=1)
             if all(term.matches_slide for term in terms):
                 stiffness = alg.symmetric_product(stiffness, observable)
-    jacobian = moments_about(stiffness, with_one(arms * frame.radius))
+    jacobian = moments_of(stiffness, arms * frame.radius)
     return Scores(_wrench(arms, total.force).T, matched.valid.astype(moved.dtype), cells, jacobian, bias)
 
 

@@ -182,9 +182,8 @@ class UnconstrainedDirection:
 
 def unconstrained_directions(directions: Directions) -> tuple[UnconstrainedDirection, ...]:
     """Directions that geometry does not constrain: unconstrained ones first, translations before rotations."""
-    free, constrained, by_matches = map(
-        np.asarray, (directions.free, directions.constrained, directions.constrained_by_matches)
-    )
+    masks = directions.free, directions.constrained, directions.constrained_by_matches
+    free, constrained, by_matches = map(np.asarray, masks)
     twists, center = (np.asarray(array, np.float64) for array in (directions.twists, directions.center))
     radius = np.asarray(directions.radius)
     # Motion of the centroid, and by rotation about it, both in metres of rms motion.

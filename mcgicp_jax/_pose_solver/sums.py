@@ -108,9 +108,9 @@ def sums_of(
     """
     posed, total, counts = linearize_at(motion, matched, terms)
     mask = jnp.asarray(matched.valid).astype(posed.moved.dtype)
-    *position, count = jnp.dot(with_one(posed.moved), mask, precision="highest")
+    with_one = jnp.concatenate([posed.moved, jnp.ones_like(posed.moved[:1])])
+    *position, count = jnp.dot(with_one, mask, precision="highest")
     center = jnp.stack(position) / jnp.maximum(count, 1)
-    h = with_one(mask * (posed.moved - center[:, None]))
     weights = normalized(counts.reshape(matched.num_candidates, -1))
     square_distances = weights * alg.inner(total.residual, total.residual)
     first = mask
@@ -129,27 +129,24 @@ def sums_of(
         rows |= {name: against * fractions.pop(name) for name in ("observability", "common")}
         rows |= {name: evidence * fraction for name, fraction in fractions.items()}
     ends = np.cumsum([len(row) for row in rows.values()])
-    split = jnp.split(moments_about(jnp.concatenate(list(rows.values())), h), ends[:-1])
+    centred = mask * (posed.moved - center[:, None])
+    split = jnp.split(moments_of(jnp.concatenate(list(rows.values())), centred), ends[:-1])
     moments = dict(zip(rows, split, strict=True))
     if "mass" in moments:
         moments["mass"] = moments["mass"][0]
     if "channel_observability" in moments:
         moments.setdefault("agreement", moments["channel_observability"])
         moments.setdefault("surplus", jnp.zeros_like(moments["channel_observability"]))
-    numbers, force = moments.pop("numbers"), moments.pop("force")[:, 3]
-    square_extent = jnp.trace(numbers[0, :3, :3])
-    _, energy, cost, square_distance, num_matched = numbers[:, 3, 3]
+    totals, force = moments.pop("numbers"), moments.pop("force")[:, 3]
+    square_extent = jnp.trace(totals[0, :3, :3])
+    _, energy, cost, square_distance, num_matched = totals[:, 3, 3]
     return Sums(center, count, square_extent, energy, cost, square_distance, num_matched, force, **moments)
 
 
-def with_one(points: Float[Array, "3 n"]) -> Float[Array, "4 n"]:
-    return jnp.concatenate([points, jnp.ones_like(points[:1])])
-
-
-def moments_about(rows: Float[Array, "R n"], h: Float[Array, "4 n"]) -> Float[Array, "R 4 4"]:
-    """Σ r h hᵀ for each row r of numbers."""
+def moments_of(rows: Float[Array, "R n"], points: Float[Array, "3 n"]) -> Float[Array, "R 4 4"]:
+    """Σ r h hᵀ for each row r of numbers, with h = (p, 1)."""
     # Without the barrier XLA evaluates h anew for each of the sixteen products.
-    h = jax.lax.optimization_barrier(h)
+    h = jax.lax.optimization_barrier(jnp.concatenate([points, jnp.ones_like(points[:1])]))
     products = (h[:, None] * h[None]).reshape(16, -1)
     return jnp.dot(rows, products.T, precision="highest").reshape(-1, 4, 4)
 
