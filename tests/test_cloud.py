@@ -167,6 +167,7 @@ def test_replace_exchanges_and_leaves_the_rest():
     assert len(cloud.replace(channels=jnp.zeros((160, 5))).channel_names) == 5
     assert cloud.replace(channels=np.zeros(160)).channels.shape == (160, 1)
     assert cloud.replace(covariances=None).covariances is None
+    assert not cloud.replace(valid=[False] * 160, origin=[1, 2, 3]).pad(200).valid.any()
     times = np.linspace(0, 1, 160)
     assert cloud.replace(times=times).times is times and isinstance(cloud.replace(times=list(times)).times, np.ndarray)
     whole = np.round(100 * np.asarray(cloud.channels))
@@ -179,6 +180,8 @@ def test_replace_refuses_what_does_not_fit():
         for shape in shapes[name]:
             refused(lambda name=name, shape=shape: ready().replace(**{name: np.zeros(shape)}), name)
     refused(lambda: ready().replace(times=np.full(160, np.nan)), "times")
+    refused(lambda: ready().replace(valid=np.ones(160)), "valid", "booleans")
+    refused(lambda: ready().replace(origin="here"), "origin")
     refused(lambda: ready().replace(colour=np.zeros((160, 3))), "replace")
 
 
@@ -374,14 +377,16 @@ def test_tables_with_named_columns_and_clouds_of_tensors():
     cloud = PointCloud(Table())
     assert cloud.channel_names == ("intensity",)
     np.testing.assert_array_equal(cloud.points, points)
-    positions, bytes_of_colors = (SimpleNamespace(numpy=lambda array=array: array) for array in (points, colors))
 
     class Attributes(dict):
         __getattr__ = dict.__getitem__
 
-    cloud = PointCloud(SimpleNamespace(point=Attributes(positions=positions, colors=bytes_of_colors)))
-    assert cloud.channel_names == ("red", "green", "blue")
-    np.testing.assert_allclose(cloud.channels, colors / 255, rtol=1e-6)
+    positions = SimpleNamespace(numpy=lambda: points)
+    for array in (colors, 257 * colors.astype(np.uint16), (colors / 255).astype(np.float32)):
+        tensor = SimpleNamespace(numpy=lambda array=array: array)
+        cloud = PointCloud(SimpleNamespace(point=Attributes(positions=positions, colors=tensor)))
+        assert cloud.channel_names == ("red", "green", "blue")
+        np.testing.assert_allclose(cloud.channels, colors / 255, rtol=1e-6)
     assert PointCloud(SimpleNamespace(point=Attributes(positions=positions))).channels.shape == (5, 0)
 
 

@@ -198,6 +198,11 @@ def test_maps_show_the_same_part_of_the_world():
     # Where the moved map has left, the paper is white; without channels it is grey.
     assert np.mean(np.all(other == 1, axis=-1)) > np.mean(np.all(one == 1, axis=-1)) + 0.1
     assert np.ptp(one, axis=-1).max() > 0.3 and np.ptp(grey, axis=-1).max() == 0
+    # Points without intensity are grey, not black.
+    valid = np.arange(len(whole)) % 2 == 0
+    dark = PointCloud(whole.points, 0.1 + whole.channels[:, 0], channel_valid=valid)
+    picture = shown(plot.maps({"": dark.replace(channel_names=["intensity"])}).axes[0])
+    assert np.mean(np.isclose(picture, 0.85 / 2)) > 0.1 > np.mean(picture == 0)
     part = plot.maps({"part": whole}, limits=np.array([[-0.2, 0.3], [-0.1, 0.1]])).axes[0]
     assert part.get_xlim()[1] == pytest.approx(0.5, rel=0.1) and part.get_ylim()[1] == pytest.approx(0.2, rel=0.1)
 

@@ -100,7 +100,8 @@ def arrays_of(points: Any) -> tuple[Any, Any, Sequence[str] | None]:
         if "colors" not in points.point:
             return points.point.positions.numpy(), None, None
         colors = points.point.colors.numpy()
-        return points.point.positions.numpy(), colors / np.float32(255 if colors.dtype == np.uint8 else 1), COLORS
+        full_scale = np.iinfo(colors.dtype).max if colors.dtype.kind == "u" else 1
+        return points.point.positions.numpy(), colors / np.float32(full_scale), COLORS
     fields = getattr(getattr(points, "dtype", None), "names", None)
     if fields is not None:
         if not {"x", "y", "z"} <= {field.lower() for field in fields}:

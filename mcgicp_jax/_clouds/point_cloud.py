@@ -301,8 +301,15 @@ class PointCloud(eqx.Module):
         channels: Any = arrays.get("channels")
         if arrays.get("times") is not None:
             arrays["times"] = _checked_times(arrays["times"])
-        for name in arrays.keys() & {"points", "channels", "covariances"}:
-            if arrays[name] is not None:
+        if "origin" in arrays:
+            arrays["origin"] = _as_float("origin", arrays["origin"])
+        if "valid" in arrays:
+            present = arrays["valid"] if isinstance(arrays["valid"], jax.Array) else np.asarray(arrays["valid"])
+            if present.dtype != bool:
+                raise ValueError(f"valid: expected booleans, got dtype {present.dtype}")
+            arrays["valid"] = present
+        for name in ("points", "channels", "covariances"):
+            if arrays.get(name) is not None:
                 array, dtype = _as_float(name, arrays[name]), self.points.dtype
                 # JAX warns of conversions to float64 where it has none.
                 dtype = dtype if isinstance(array, np.ndarray) else jax.dtypes.canonicalize_dtype(dtype)

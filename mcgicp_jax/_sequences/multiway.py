@@ -139,7 +139,7 @@ def multiway(
             valid = [isinstance(row, int | np.integer) and 0 <= row < len(ready) for row in pair]
             if len(pair) != 2 or not all(valid) or pair[0] == pair[1]:
                 raise ValueError(f"pairs[{k}]: expected two different rows from 0 to {len(ready) - 1}, got {pair}")
-        pairs = [(int(i), int(j)) for i, j in pairs]
+        pairs = list(dict.fromkeys((int(i), int(j)) for i, j in pairs))
     poses, registrations = _initial_poses(init, ready, method, settings)
     if pairs is not None:
         registrations = {pair: result for pair, result in registrations.items() if pair in pairs}

@@ -254,7 +254,10 @@ def _shaded(cloud: PointCloud, view: View) -> Picture:
     points, colors = np.asarray(cloud.points), drawing.rgb_of(cloud)
     if colors is None:
         if "intensity" in cloud.channel_names:
-            values = np.asarray(cloud.channels)[:, cloud.channel_names.index("intensity")]
+            column = cloud.channel_names.index("intensity")
+            values = np.asarray(cloud.channels)[:, column]
+            if cloud.channel_valid is not None:
+                values = np.where(np.asarray(cloud.channel_valid)[:, column], values, np.nan)
         else:
             values = view.project(points)[1]
         low, high = np.nanpercentile(values, [2, 98]) if np.isfinite(values).any() else (0.0, 1.0)
