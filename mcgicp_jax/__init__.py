@@ -72,8 +72,7 @@ from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP, estimate_cha
 from mcgicp_jax._methods.ndt import D2DNDT, NDT, ColorNDT, voxel_gaussians
 from mcgicp_jax._pairs.batch import register_as_completed, register_batch
 from mcgicp_jax._pairs.batch_jobs import PairWarning
-from mcgicp_jax._pairs.cost import mahalanobis_cost
-from mcgicp_jax._pairs.estimate_pose import estimate_pose
+from mcgicp_jax._pairs.given_matches import estimate_pose, mahalanobis_cost
 from mcgicp_jax._pairs.register import register
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph

@@ -122,7 +122,7 @@ def test_chunks_are_as_large_as_memory_allows(memory, size):
     group = chunks._Group(print, mock.Mock(spec=Mesh, devices=[device]), 64)
     cloud = SimpleNamespace(valid=np.ones(2048))
     group.waiting.append((0, (None, None, cloud, cloud)))
-    assert group._largest() == size
+    assert group.largest() == size
 
 
 @pytest.mark.slow

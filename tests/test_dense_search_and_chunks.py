@@ -16,7 +16,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import DenseSearch, KDTreeSearch, Status
 from mcgicp_jax._pairs import batch_jobs
 from mcgicp_jax._pairs.batch_jobs import BatchJob
-from mcgicp_jax._registration import chunks, register_pair
+from mcgicp_jax._registration import chunks, start_check
 from mcgicp_jax.extend import SearchPoints
 from mcgicp_jax.metrics import pose_error
 from tests import reference as ref
@@ -190,7 +190,7 @@ def test_pairs_that_may_have_left_a_right_pose_are_registered_again(monkeypatch)
         return mcg.register_batch(*given, mcg.GICP(), init=[starts[i] for i in rows], search=DenseSearch())
 
     with monkeypatch.context() as patched:
-        patched.setattr(register_pair, "doubt_of_start", partial(noted, on_host))
+        patched.setattr(start_check, "doubt_of_start", partial(noted, on_host))
         cases = zip(sources, targets, starts, strict=True)
         expected = [mcg.register(source, target, mcg.GICP(), init=start) for source, target, start in cases]
     monkeypatch.setattr(chunks, "doubt_of_start", partial(noted, traced))

@@ -9,7 +9,7 @@ import pytest
 import mcgicp_jax as mcg
 from mcgicp_jax import Status
 from mcgicp_jax._math.poses import matrix_of, se3_from_matrix
-from mcgicp_jax._registration import register_pair
+from mcgicp_jax._registration import start_check
 from mcgicp_jax._registration.start_check import SurfaceFit, doubt_of_start
 from tests.promise_scenes import office, translation, views
 from tests.scenes import motion, room_corner
@@ -120,7 +120,7 @@ def test_a_pose_far_from_the_initial_one_is_unverified_if_surfaces_coincide_near
 def test_a_pose_further_off_than_half_the_coarse_distance_is_doubted(monkeypatch, metres, by_channels, is_doubted):
     """However well surfaces coincide and however many match; in an aisle of shelves, another bay was CONVERGED."""
     calls = []
-    monkeypatch.setattr(register_pair, "doubt_of_start", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(start_check, "doubt_of_start", lambda *arguments: calls.append(arguments))
     pair = office(0, 500)
     mcg.register(pair.source, pair.target, GICP, max_distance=(6.0, 0.5))
     ((_, state, settings, *_),) = calls

@@ -32,7 +32,8 @@ from mcgicp_jax._pairs.batch_jobs import NUM_CHECKED, BatchJob, Pair, PairResult
 from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax._registration.assessment import with_traced_pose
 from mcgicp_jax._registration.options import Options
-from mcgicp_jax._registration.register_pair import Run, results_of
+from mcgicp_jax._registration.pose_derivative import Run
+from mcgicp_jax._registration.register_pair import results_of
 from mcgicp_jax._registration.result import RegistrationResult, Status
 
 GivenExecutor: TypeAlias = Executor | Literal["processes", "threads"] | None
@@ -122,17 +123,22 @@ def run_differentiated(
             source, target = values[:2]
             # Threads take the prior as it was checked, perhaps as a tracer; workers check its values.
             prior: Any = values.prior if at_home else ready.prior
-            start = ready.init, prior, ready.traced, ready.doubt, ready.max_coarse_distance
+            traced = tuple(i for i, leaf in enumerate(ready.leaves) if not is_concrete(leaf))
+            start = ready.init, prior, traced, ready.doubt, ready.max_coarse_distance
             yield Pair(pair.index, source, target, *start)
 
-    fixed = replace(job, method=primal(job.method), options=replace(job.options, robust=primal(job.options.robust)))
-    for answer in _results(fixed, sent(), executor, count, fixed.run_chunk):
+    options = replace(job.options, robust=primal(job.options.robust))
+    fixed = replace(job, method=primal(job.method), options=options, is_differentiated=True)
+    for answer in _results(fixed, sent(), executor, count):
         if isinstance(answer, RanPair):
             runs[answer.index] = answer.run
             continue
         ready, result = prepared[answer.index], answer.registration
         if answer.jacobian:
-            values, inputs = [np.asarray(result.centred.wxyz_xyz)], [ready.leaves[i] for i in ready.traced]
+            values, inputs = (
+                [np.asarray(result.centred.wxyz_xyz)],
+                [leaf for leaf in ready.leaves if not is_concrete(leaf)],
+            )
             (pose,) = with_derivative(values, KnownJacobian(answer.jacobian), inputs)
             origins = ready.inputs.source.origin, ready.inputs.target.origin
             if is_concrete(origins):
@@ -148,32 +154,24 @@ def run_differentiated(
 
 
 def _results(
-    job: BatchJob,
-    pairs: Iterator[Pair],
-    executor: ChosenExecutor,
-    count: int | None,
-    in_thread: Callable[..., Any] | None = None,
+    job: BatchJob, pairs: Iterator[Pair], executor: ChosenExecutor, count: int | None
 ) -> Generator[Any, None, None]:
-    """The results of pairs. `in_thread`: what threads do with a chunk of pairs that are differentiated; its errors are
-    raised."""
-    if executor is None and in_thread is None and job.uses_chunks:
+    if executor is None and job.uses_chunks:
         yield from map(PairResult.with_warning, job.register_in_chunks(pairs, num_cores()))
     elif executor is None:
-        yield from _by_threads_then_processes(job, pairs, count, in_thread)
+        yield from _by_threads_then_processes(job, pairs, count)
     elif executor == "threads":
-        yield from _by_threads(job, pairs, in_thread)
+        yield from _by_threads(job, pairs)
     else:
         yield from ChunkedExecutor(job, executor).run(pairs)
 
 
-def _by_threads(job: BatchJob, pairs: Iterator[Pair], in_thread: Callable[..., Any] | None) -> Iterator[Any]:
+def _by_threads(job: BatchJob, pairs: Iterator[Pair]) -> Iterator[Any]:
     with ThreadPoolExecutor(num_cores(), thread_name_prefix="mcgicp") as threads:
-        yield from ChunkedExecutor(job, threads, max_submitted=2 * num_cores(), work=in_thread).run(pairs)
+        yield from ChunkedExecutor(job, threads, own_threads=True).run(pairs)
 
 
-def _by_threads_then_processes(
-    job: BatchJob, pairs: Iterator[Pair], count: int | None, in_thread: Callable[..., Any] | None
-) -> Iterator[Any]:
+def _by_threads_then_processes(job: BatchJob, pairs: Iterator[Pair], count: int | None) -> Iterator[Any]:
     """Threads register the first pairs, and are timed. If processes pay, they start meanwhile and register the rest."""
     rest: Iterator[Pair] | None = None
     start = _Start(job, count)
@@ -192,7 +190,7 @@ def _by_threads_then_processes(
             yield pair
 
     try:
-        for result in _by_threads(job, until_processes_run(), in_thread):
+        for result in _by_threads(job, until_processes_run()):
             start.finished += 1
             begin = time.perf_counter()
             yield result
@@ -221,7 +219,13 @@ class _Start:
         self._first: Future[int] | None = None
         # Seconds that it takes to send a pair, once it is known.
         self._sending: float | None = None
-        self._num_workers = min(num_cores(), _available_memory() // _MEMORY)
+        # In a container, further processes may use what this one does not of its limit, bytes.
+        available = psutil.virtual_memory().available
+        for path in _MEMORY_LIMITS:
+            # There is no such file, or no limit.
+            with contextlib.suppress(OSError, ValueError):
+                available = min(available, int(path.read_text()) - psutil.Process().memory_info().rss)
+        self._num_workers = min(num_cores(), available // _MEMORY)
         # Workers of other pools have their cores to themselves.
         self.possible = self._num_workers > 1 and current_process().name == "MainProcess"
 
@@ -268,43 +272,30 @@ class _Start:
         return self._sending is not None and left * (saved - self._sending) > _PAYS * start
 
 
-def _available_memory() -> int:
-    """Bytes that further processes may use; in a container, those of its limit that this one does not."""
-    available = psutil.virtual_memory().available
-    for path in _MEMORY_LIMITS:
-        # There is no such file, or no limit.
-        with contextlib.suppress(OSError, ValueError):
-            available = min(available, int(path.read_text()) - psutil.Process().memory_info().rss)
-    return available
-
-
 class ChunkedExecutor:
     """Chunks of pairs submitted to an executor, and pairs to retry.
 
     A chunk may fail because one of its pairs killed the worker, or because another chunk broke the pool. The pairs of
     failed chunks are suspects, submitted again at the end one by one: only those that fail alone get `WORKER_FAILED`.
     `at_home`: whether pairs that cannot be sent to another process are registered in this one, instead of an error.
-    `work`: what workers do with a chunk, if not `register_chunk`; its errors are raised.
+    `own_threads`: whether the executor is that of `_by_threads`, where errors of differentiated pairs are raised.
     """
 
-    def __init__(
-        self,
-        job: BatchJob,
-        executor: Executor,
-        at_home: bool = False,
-        max_submitted: int = _MAX_SUBMITTED,
-        work: Callable[..., Any] | None = None,
-    ):
+    def __init__(self, job: BatchJob, executor: Executor, at_home: bool = False, own_threads: bool = False):
         self._executor, self._at_home = executor, job if at_home else None
         self._replacement: Executor | None = None
         self._pickled = not isinstance(executor, ThreadPoolExecutor)
-        self._chunk_size, self._max_submitted = _CHUNK_SIZE if self._pickled else 1, max_submitted
-        if isinstance(executor, Processes):
+        self._chunk_size = _CHUNK_SIZE if self._pickled else 1
+        self._max_submitted = 2 * num_cores() if own_threads else _MAX_SUBMITTED
+        job = _as_numpy(job) if self._pickled else job
+        work: Callable[..., Any] = job.register_chunk
+        self._raises = own_threads and job.is_differentiated
+        if self._raises:
+            work = job.run_chunk
+        elif isinstance(executor, Processes):
+            work = job.register_chunk_alone
             # More submitted chunks than loky's queue holds, so that no worker waits.
             self._chunk_size, self._max_submitted = _SMALL_CHUNK, 4 * executor.num_workers
-        job = _as_numpy(job) if self._pickled else job
-        self._raises = work is not None
-        work = work or (job.register_chunk_alone if isinstance(executor, Processes) else job.register_chunk)
         self._register = with_settings(work, pickled=self._pickled)
         self._suspects: collections.deque[Pair] = collections.deque()
         self._submitted: dict[Future[list[PairResult | RanPair]], list[Pair]] = {}

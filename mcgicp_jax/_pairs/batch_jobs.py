@@ -19,7 +19,7 @@ from mcgicp_jax._clouds.origins import centred_pose
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.preprocess import check_preprocessing
 from mcgicp_jax._clouds.voxel_size import VoxelSize
-from mcgicp_jax._compute.concrete import is_concrete, is_deferred
+from mcgicp_jax._compute.concrete import is_deferred
 from mcgicp_jax._compute.devices import computed_on_cpu, on_accelerator
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn, warnings_named
@@ -29,25 +29,12 @@ from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import doubt_of, doubt_of_start_pose, start_from_anywhere
 from mcgicp_jax._pose_solver.pose_measurements import Prior
+from mcgicp_jax._registration import input_checks
 from mcgicp_jax._registration.assessment import registration_of
 from mcgicp_jax._registration.chunks import ChunkPair, Refused, run_pairs
-from mcgicp_jax._registration.input_checks import (
-    check_clouds,
-    warn_of_estimated_parameters,
-    warn_of_inputs,
-    warn_of_lengths,
-)
-from mcgicp_jax._registration.on_host import HostExecutor
 from mcgicp_jax._registration.options import Options, check_method
-from mcgicp_jax._registration.pose_derivative import Inputs, parameters_by
-from mcgicp_jax._registration.register_pair import (
-    Run,
-    prepared,
-    preprocessed,
-    results_of,
-    run_pair,
-    without_sensor_patterns,
-)
+from mcgicp_jax._registration.pose_derivative import Inputs, Run, parameters_by
+from mcgicp_jax._registration.register_pair import prepared, preprocessed, results_of, run_pair, without_sensor_patterns
 from mcgicp_jax._registration.result import RegistrationResult, Status, computed, unknown_uncertainty, verified
 from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, checked_measurements
 from mcgicp_jax._search.brute_force import DenseSearch
@@ -145,10 +132,6 @@ class PreparedPair:
         """Those of clouds, method and kernel."""
         return jax.tree.leaves(self.inputs[:4], is_leaf=is_deferred)
 
-    @property
-    def traced(self) -> tuple[int, ...]:
-        return tuple(i for i, leaf in enumerate(self.leaves) if not is_concrete(leaf))
-
     def checked(self, result: RegistrationResult) -> RegistrationResult:
         """The result, UNVERIFIED if the initial pose is, or the overlap is small."""
         return verified(result, not self.doubt)
@@ -162,7 +145,7 @@ def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return work(self, pair, *arguments)
         except ValueError as error:
-            return _invalid(pair.index, error)
+            return PairResult(pair.index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
     return caught
 
@@ -170,7 +153,7 @@ def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
 @dataclass(frozen=True)
 class BatchJob:
     """Settings of all pairs. `checked`: whether to look at neighbourhoods, units and patterns in channels, and warn.
-    Patterns are left out in any case; chunks find them on the device."""
+    Patterns are left out in any case; chunks find them on the device. `is_differentiated`: see `run_differentiated`."""
 
     method: AbstractMethod
     options: Options
@@ -179,6 +162,7 @@ class BatchJob:
     covariances: bool = True
     has_priors: bool = False
     checked: bool = True
+    is_differentiated: bool = False
 
     def __post_init__(self) -> None:
         check_method(self.method)
@@ -196,7 +180,8 @@ class BatchJob:
         """Whether pairs run in chunks of one program, if no executor is given."""
         repeated = self.options.equalize_channels or len(self.options.voxel_sizes) > 0 or self.has_priors
         search = self.options.search
-        return (on_accelerator() if search is None else isinstance(search, DenseSearch)) and not repeated
+        on_device = on_accelerator() if search is None else isinstance(search, DenseSearch)
+        return on_device and not repeated and not self.is_differentiated
 
     def ready(self, clouds: dict[str, Cloud], checked: bool = True) -> list[PointCloud]:
         """Clouds by their names, read and preprocessed if necessary; errors become a `ValueError` that names one."""
@@ -208,10 +193,10 @@ class BatchJob:
         with warnings_named(f"pair {pair.index}"):
             source, target = self.ready({"source": pair.source, "target": pair.target}, neighborhoods_checked)
             if self.checked:
-                warn_of_lengths(source, target)
+                input_checks.warn_of_lengths(source, target)
         options, soft = self.options, self.options.soft_matches is not False
         # Warnings from here on do not name the pair, so that Python shows each once.
-        warn_of_estimated_parameters(self.method, source, target, soft, options.equalize_channels)
+        input_checks.warn_of_estimated_parameters(self.method, source, target, soft, options.equalize_channels)
         inputs = prepared(source, target, self.method, options, prior=pair.prior, channels_checked=self.checked)
         if not isinstance(pair.init, str):
             init = pair.prior[0] if pair.init is None and pair.prior is not None else pair.init
@@ -251,7 +236,7 @@ class BatchJob:
             return run
         (result,) = map(ready.checked, results_of([run], [run.inputs]))
         arrays = [ready.leaves[i] for i in pair.traced]
-        slopes = parameters_by(ready.inputs, run.inputs, cast(HostExecutor, run.executor), run.loop, arrays)
+        slopes = parameters_by(ready.inputs, run, arrays)
         blocks = tuple(slope.astype(array.dtype) for slope, array in zip(slopes, arrays, strict=True))
         return replace(self._result(pair.index, result, ready.doubt or run.doubt), jacobian=blocks)
 
@@ -264,11 +249,10 @@ class BatchJob:
 
     def _sent(self, pair: Pair) -> PreparedPair:
         """A pair of `run_differentiated`, of values."""
-        values: Any = (pair.source, pair.target, self.method, self.options.robust)
-        prior: Any = pair.prior
+        source, target, prior = cast(Any, (pair.source, pair.target, pair.prior))
         if not isinstance(prior, Prior):
-            prior = checked_measurements(None, prior, *values[:2])[1]
-        inputs = Inputs(*values)._replace(prior=prior)
+            _, prior = checked_measurements(None, prior, source, target)
+        inputs = Inputs(source, target, self.method, self.options.robust, prior=prior)
         return PreparedPair(pair.index, inputs, cast(Pose, pair.init), None, pair.doubt, pair.max_coarse_distance)
 
     @_of_a_pair
@@ -302,12 +286,10 @@ class BatchJob:
             rejected: list[PairResult] = []
             again: collections.deque[Future[PairResult]] = collections.deque()
             register = with_settings(unchecked._register_prepared)
-
-            def prepared_pair(pair: Pair) -> PairResult | tuple[PreparedPair, ChunkPair]:
-                return (on_host if pair.index < NUM_CHECKED else unchecked)._chunk_pair(pair)
+            prepare = with_settings(lambda pair: (on_host if pair.index < NUM_CHECKED else unchecked)._chunk_pair(pair))
 
             def ready() -> Iterator[tuple[PreparedPair, ChunkPair]]:
-                for pair in _computed_ahead(with_settings(prepared_pair), pairs, one, threads, 2 * num_threads):
+                for pair in _computed_ahead(prepare, pairs, one, threads, 2 * num_threads):
                     if isinstance(pair, PairResult):
                         rejected.append(pair)
                     else:
@@ -320,17 +302,17 @@ class BatchJob:
                     yield again.popleft().result()
                 pair = ended.key
                 if isinstance(ended, Refused):
-                    yield _invalid(pair.index, ended.reason)
-                    continue
-                if ended.has_doubt:
+                    invalid = RegistrationResult.without_pose(Status.INVALID_INPUT)
+                    yield PairResult(pair.index, invalid, str(ended.reason))
+                elif ended.has_doubt:
                     again.append(threads.submit(register, pair))
-                    continue
-                source, target = pair.inputs[:2]
-                matchable = np.ones(min(len(source), most or len(source)), bool)
-                result = registration_of(ended.state, ended.assessment, ended.history, source, target, matchable)
-                is_doubtful = result.status is Status.UNVERIFIED
-                doubt = pair.doubt or (doubt_of_patterns(source) if is_doubtful else "")
-                yield self._result(pair.index, pair.checked(result), doubt)
+                else:
+                    source, target = pair.inputs[:2]
+                    matchable = np.ones(min(len(source), most or len(source)), bool)
+                    result = registration_of(ended.state, ended.assessment, ended.history, source, target, matchable)
+                    is_doubtful = result.status is Status.UNVERIFIED
+                    doubt = pair.doubt or (doubt_of_patterns(source) if is_doubtful else "")
+                    yield self._result(pair.index, pair.checked(result), doubt)
             yield from rejected
             yield from (future.result() for future in again)
 
@@ -343,9 +325,9 @@ class BatchJob:
         if isinstance(ready, PairResult):
             return ready
         source, target = ready.inputs[:2]
-        check_clouds(source, target, self.method)
+        input_checks.check_clouds(source, target, self.method)
         if self.checked:
-            warn_of_inputs(source, target, self.method, self.options.equalize_channels)
+            input_checks.warn_of_inputs(source, target, self.method, self.options.equalize_channels)
         pose = se3_from_matrix(centred_pose(ready.init, source, target), source.points.dtype)
         # `preprocess` returns clouds that have neighbours as they are; the others get theirs on the devices.
         sides = []
@@ -365,10 +347,6 @@ class BatchJob:
     def with_wanted_fields(self, result: RegistrationResult) -> RegistrationResult:
         """The result, without covariance if so wanted."""
         return result if self.covariances else result.build(**vars(result) | {"uncertainty": unknown_uncertainty()})
-
-
-def _invalid(index: int, error: ValueError) -> PairResult:
-    return PairResult(index, RegistrationResult.without_pose(Status.INVALID_INPUT), str(error))
 
 
 def _read(clouds: dict[str, Cloud]) -> dict[str, PointCloud]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, Never, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Never, TypeAlias, cast
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -133,28 +133,27 @@ def register(
             channels or `channel_weights` are differentiated with `soft_matches=False`; or if channels are
             differentiated while Λ or α of the method is estimated from them.
     """
-    options_of(register, unknown)
     check_method(method)
-    options = Options(
-        max_distance=max_distance,
-        max_iterations=max_iterations,
-        translation_tolerance=translation_tolerance,
-        rotation_tolerance=rotation_tolerance,
-        robust=robust,
-        search=search,
-        hold_unconstrained=hold_unconstrained,
-        equalize_channels=equalize_channels,
-        voxel_sizes=voxel_sizes,
-        max_source_points=max_source_points,
-        soft_matches=soft_matches,
-    )
+    arguments = {
+        "max_distance": max_distance,
+        "max_iterations": max_iterations,
+        "translation_tolerance": translation_tolerance,
+        "rotation_tolerance": rotation_tolerance,
+        "robust": robust,
+        "search": search,
+        "hold_unconstrained": hold_unconstrained,
+        "equalize_channels": equalize_channels,
+        "voxel_sizes": voxel_sizes,
+        "max_source_points": max_source_points,
+        "soft_matches": soft_matches,
+    }
+    options = options_of(register, arguments | unknown)
     if not (tie_points is None and prior is None) and not hold_unconstrained:
         raise ValueError("hold_unconstrained: expected True with tie_points or a prior (--fix), got False")
     source, target = as_cloud("source", source), as_cloud("target", target)
     warn_of_lengths(source, target)
     warn_of_estimated_parameters(method, source, target, soft_matches is not False, equalize_channels)
-    trusted = True
-    pose: Any = init
+    trusted, pose = True, cast(Any, init)
     if isinstance(init, str):
         start, distance = start_from_anywhere(init, primal(source), primal(target), options)
         pose, trusted = start.matrix, start.success

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,14 +22,8 @@ from mcgicp_jax._compute.linear_maps import primal, without_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._math.poses import adjoint_to_center, se3_from_matrix, translation_adjoint, units
 from mcgicp_jax._math.statistics import sampled_rows
-from mcgicp_jax._pose_solver.covariance import (
-    Frame,
-    Moments,
-    discounts_and_radius,
-    moments_from,
-    noise_sample,
-    sandwich,
-)
+from mcgicp_jax._pose_solver import covariance as covariance_estimate
+from mcgicp_jax._pose_solver.covariance import Frame, Moments
 from mcgicp_jax._pose_solver.degeneracy import directions_at_source
 from mcgicp_jax._pose_solver.fusion import fused_covariance
 from mcgicp_jax._pose_solver.matched import Motion, sample_of_term
@@ -49,32 +44,32 @@ class Assessment(NamedTuple):
     constraints: Lazy[Constraints]
     covariance: Lazy[Float[AnyArray, "*batch 6 6"]]
 
-    @classmethod
-    def without_covariance(cls, state: State) -> Assessment:
-        """Of a traced state, with NaN for the covariance, whose computation takes most of the time of an assessment."""
-        return cls(Lazy.of(constraints_of(state)), Lazy.of(jnp.full((6, 6), jnp.nan)))
 
-
-def assessment_of(executor: AbstractExecutor, loop: LoopResult) -> Assessment:
+def assessment_of(executor: AbstractExecutor, loop: LoopResult, with_covariance: bool = True) -> Assessment:
+    """The assessment of a loop; traced ones without covariance, which takes most of the time, have NaN for it."""
     state = loop.state
 
-    def weights() -> Moments | Fusion:
+    def covariance() -> Float[AnyArray, "6 6"]:
         fusion = executor.problem.fusion
-        return moments_of(executor, loop) if fusion is None else fusion
-
-    def covariance() -> Float[np.ndarray, "6 6"]:
+        weights = moments_of(executor, loop) if fusion is None else fusion
+        if not is_concrete(state):
+            return covariance_of_pose(state, weights)
         # In float64: unconstrained directions have large variances, next to which others would be lost to rounding.
         with jax.enable_x64(True):
-            return np.asarray(_covariance_on_host(*as_float64((state._replace(record=None), weights()))))
+            return np.asarray(_covariance_on_host(*as_float64((state._replace(record=None), weights))))
 
-    if not is_concrete(state):
-        return Assessment(Lazy.of(constraints_of(state)), Lazy.of(covariance_of_pose(state, weights())))
-    return Assessment(Lazy(lambda: jax.tree.map(np.asarray, _constraints_on_host(state))), Lazy(covariance))
+    if is_concrete(state):
+        return Assessment(Lazy(lambda: jax.tree.map(np.asarray, _constraints_on_host(state))), Lazy(covariance))
+    constraints = Lazy.of(constraints_of(state))
+    return Assessment(constraints, Lazy.of(covariance() if with_covariance else jnp.full((6, 6), jnp.nan)))
 
 
 def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     problem, state, motion = executor.problem, loop.state, Motion.of(loop.state.pose.wxyz_xyz)
-    search = executor.source_of(loop.matches)
+    search, matched_rows = problem.source.search, loop.matches.rows
+    if matched_rows is not None:
+        # In the coarse phase on the host.
+        search = jax.tree.map(lambda array: array[matched_rows], search)
     xp, one = numpy_for(search.valid), np.ones((), problem.source.points.dtype)
     # Padding does not change which cells share a sum.
     num_cells = xp.maximum(search.valid.sum(), 1).astype(np.int32)
@@ -85,10 +80,10 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
         sampled = loop.matches.some(rows)
         first = executor.distances(motion, sampled).argmin(axis=0)[None]
         nearest = sampled._replace(indices=numpy_for(first).take_along_axis(sampled.indices, first, axis=0))
-        sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
+        sample = executor.rows(covariance_estimate.noise_sample, motion, nearest, with_noise=True)
         sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
         num_channels = xp.sum(xp.any(search.descriptors != 0, axis=0))
-        discount, neighborhood_radius = discounts_and_radius(sample, num_channels)
+        discount, neighborhood_radius = covariance_estimate.discounts_and_radius(sample, num_channels)
         frame = frame._replace(discount=discount, neighborhood_radius=neighborhood_radius)
     responding = None
     # Fixed matches do not respond to a motion.
@@ -97,7 +92,7 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
     ours, theirs = problem.settings.rounding
     rounding = (motion.rotation * ours) @ motion.rotation.T + numpy_for(theirs).diag(theirs)
-    return moments_from(scores, search.valid.size)._replace(rounding=rounding)
+    return covariance_estimate.moments_from(scores, search.valid.size)._replace(rounding=rounding)
 
 
 def _with_response(term: AbstractTerm, executor: AbstractExecutor, loop: LoopResult) -> AbstractTerm:
@@ -140,7 +135,7 @@ def covariance_of_pose(state: State, weights: Moments | Fusion) -> Float[Array, 
     if isinstance(weights, Fusion):
         covariance = fused_covariance(state.pose, weights)
     else:
-        covariance = sandwich(state.pose, center, radius, weights, state.directions)
+        covariance = covariance_estimate.sandwich(state.pose, center, radius, weights, state.directions)
     return jnp.where(exists, covariance, jnp.nan)
 
 
@@ -161,15 +156,27 @@ def registration_of(
     """The result of a final state, in the user's frames; NumPy where everything is concrete. `matchable`: the source
     points that could be matched. Only the pose has a derivative by traced `inputs`."""
     # Outside `jit`, only the pose and the origins may be traced, by differentiation.
-    pose, source_origin, target_origin = state.pose, source.origin, target.origin
+    pose, source_origin = state.pose, source.origin
     fixed_pose, origin = primal((pose, source_origin))
-    at_origin, concrete = are_zero(origin), is_concrete(state.status)
+    concrete = is_concrete(state.status)
     numbers: Any = state.status, state.num_iterations, state.record, records._asdict(), matchable
     if concrete:
-        # Reading NumPy arrays compiles nothing, and NumPy scalars print as numbers.
-        numbers = jax.tree.map(lambda array: np.asarray(array)[()], numbers)
+        # Reading NumPy arrays compiles nothing, and NumPy scalars, unlike arrays without axes, print as numbers.
+        numbers = jax.tree.map(itemgetter(()), jax.tree.map(np.asarray, numbers))
     status, num_iterations, record, history, matchable = numbers
     num_inliers, center = record.num_inliers.astype(np.int32), state.sums.center
+
+    def constraints() -> Constraints:
+        information, directions = assessment.constraints.value
+        to_centred, from_centred = translation_adjoint(-origin), translation_adjoint(origin)
+        # Non-finite values belong to the status NON_FINITE; NumPy need not warn of them.
+        with np.errstate(invalid="ignore", over="ignore"):
+            if directions is not None:
+                moved = directions.twists @ from_centred.T, directions.center + origin
+                directions = eqx.tree_at(lambda d: (d.twists, d.center), directions, moved)
+            return Constraints(to_centred.T @ information @ to_centred, directions)
+
+    uncertainty = partial(_uncertainty_in_user_frame, assessment, fixed_pose, center, origin)
     constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)
     return RegistrationResult.build(
         status_code=status,
@@ -179,14 +186,10 @@ def registration_of(
         rmse=constant_by(record.rmse),
         overlap=(num_inliers / matchable.sum().clip(1)).astype(record.rmse.dtype),
         history=history,
-        constraints=assessment.constraints
-        if at_origin
-        else _later(lambda: _constraints_in_user_frame(assessment, origin), concrete),
-        uncertainty=_later(
-            lambda: _uncertainty_in_user_frame(assessment, fixed_pose, center, origin), concrete, constant_by
-        ),
+        constraints=assessment.constraints if are_zero(origin) else _later(constraints, concrete),
+        uncertainty=_later(uncertainty, concrete, constant_by),
         derivative=Held(derivative),
-        **fields_of_pose(pose, source_origin, target_origin),
+        **fields_of_pose(pose, source_origin, target.origin),
     )
 
 
@@ -203,10 +206,10 @@ def with_traced_pose(
 ) -> RegistrationResult:
     """A result of values, with a centred pose that has a derivative by traced `inputs`."""
     constant_by = partial(without_derivative, inputs=inputs, message=_NO_DERIVATIVE)
-    numbers = {"cost": constant_by(result.cost), "rmse": constant_by(result.rmse)}
-    uncertainty = _later(lambda: result.uncertainty.value, True, constant_by)
-    fields = numbers | fields_of_pose(pose, source_origin, target_origin)
-    return result.build(**vars(result) | fields | {"uncertainty": uncertainty})
+    fields = fields_of_pose(pose, source_origin, target_origin)
+    fields |= {"cost": constant_by(result.cost), "rmse": constant_by(result.rmse)}
+    fields["uncertainty"] = _later(lambda: result.uncertainty.value, True, constant_by)
+    return result.build(**vars(result) | fields)
 
 
 def _later(compute: Callable[[], Any], concrete: bool, constant_by: Callable[[Any], Any] = lambda value: value) -> Lazy:
@@ -228,17 +231,6 @@ def _later(compute: Callable[[], Any], concrete: bool, constant_by: Callable[[An
         return values
 
     return Lazy(read_only, finish) if concrete else Lazy.of(constant_by(compute()))
-
-
-def _constraints_in_user_frame(assessment: Assessment, origin: Any) -> Constraints:
-    information, directions = assessment.constraints.value
-    to_centred, from_centred = translation_adjoint(-origin), translation_adjoint(origin)
-    # Non-finite values belong to the status NON_FINITE; NumPy need not warn of them.
-    with np.errstate(invalid="ignore", over="ignore"):
-        if directions is not None:
-            moved = directions.twists @ from_centred.T, directions.center + origin
-            directions = eqx.tree_at(lambda d: (d.twists, d.center), directions, moved)
-        return Constraints(to_centred.T @ information @ to_centred, directions)
 
 
 def _uncertainty_in_user_frame(assessment: Assessment, pose: jaxlie.SE3, center: Any, origin: Any) -> Uncertainty:

@@ -10,13 +10,12 @@ import collections
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jaxlie
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
 
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.preprocess_inside_jit import traced_neighbors
@@ -24,9 +23,8 @@ from mcgicp_jax._compute.concrete import DeferredRows
 from mcgicp_jax._compute.devices import default_devices
 from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._compute.threads import with_settings_of_package
-from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._registration.assessment import Assessment
+from mcgicp_jax._registration.assessment import Assessment, assessment_of
 from mcgicp_jax._registration.loop import Record, State
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs
@@ -34,8 +32,6 @@ from mcgicp_jax._registration.register_pair import problem_of, without_sensor_pa
 from mcgicp_jax._registration.start_check import doubt_of_start, surface_fit
 from mcgicp_jax._registration.traced import TracedExecutor, assess
 from mcgicp_jax._search.base import AbstractSearch
-
-Key = TypeVar("Key")
 
 # Numbers of pairs of a chunk per device: with a sketch on an H200, chunks of 256 pairs took 0.7 (2,000 points) to 0.95
 # (6,000 points) of the time of chunks of 64. Batches of fewer pairs have smaller chunks. Each size compiles.
@@ -73,31 +69,31 @@ class ChunkPair(NamedTuple):
     target: PointCloud
 
 
-class Ended(NamedTuple, Generic[Key]):
+class Ended(NamedTuple):
     """A registration that has ended, with the key of its pair; and whether it may have left a right initial pose."""
 
-    key: Key
+    key: Any
     state: State
     assessment: Assessment
     history: Record
     has_doubt: bool
 
 
-class Refused(NamedTuple, Generic[Key]):
+class Refused(NamedTuple):
     """The key of a pair whose shapes the method refuses, and its reason."""
 
-    key: Key
+    key: Any
     reason: ValueError
 
 
 def run_pairs(
-    pairs: Iterable[tuple[Key, ChunkPair]],
+    pairs: Iterable[tuple[Any, ChunkPair]],
     method: AbstractMethod,
     options: Options,
     search: AbstractSearch,
     num_neighbors: int,
     covariances: bool,
-) -> Iterator[Ended[Key] | Refused[Key]]:
+) -> Iterator[Ended | Refused]:
     """Register many pairs, spread over the `default_devices`, and yield their results.
 
     `num_neighbors` is for clouds without neighbours. Pairs of similar sizes share a program: to compile one takes as
@@ -111,18 +107,12 @@ def run_pairs(
         **{name: getattr(options, name) for name in ("max_iterations", "max_source_points", "min_coarse_distance")}
     )
     mesh = Mesh(np.array(default_devices()), ("pairs",))
-    program = partial(
-        _registered,
-        method=method,
-        robust=options.robust,
-        numbers=numbers,
-        search=search,
-        options=fixed,
-        num_neighbors=num_neighbors,
-        covariances=covariances,
-        mesh=mesh,
-    )
-    groups: dict[Any, _Group[Key]] = {}
+
+    def program(chunk: ChunkPair, max_updates: Any) -> Any:
+        common = method, options.robust, numbers, max_updates, search
+        return _registered(chunk, common, fixed, num_neighbors, covariances, mesh)
+
+    groups: dict[Any, _Group] = {}
     last: dict[Any, int] = {}
     sizes: list[tuple[int, int]] = []
     for number, (key, pair) in enumerate(pairs):
@@ -141,16 +131,17 @@ def run_pairs(
         if kind not in groups:
             groups[kind] = _Group(program, mesh, fixed.max_iterations)
         last[kind] = number
-        groups[kind].waiting.append((key, pair))
-        while groups[kind].is_full():
-            yield from groups[kind].run()
+        group = groups[kind]
+        group.waiting.append((key, pair))
+        while len(group.waiting) >= (group.per_device or group.largest()) * mesh.size:
+            yield from group.run()
         for rare in [kind for kind in groups if number - last[kind] > _PATIENCE]:
             yield from groups.pop(rare).finish()
     for group in groups.values():
         yield from group.finish()
 
 
-class _Group(Generic[Key]):
+class _Group:
     """Pairs of the same shapes, in chunks. Where memory does not suffice, chunks are halved and begin again."""
 
     def __init__(self, program: Callable[..., Any], mesh: Mesh, max_iterations: int):
@@ -158,14 +149,15 @@ class _Group(Generic[Key]):
         # A loop that has not ended has made at most one update less.
         self._all_updates = max_iterations + 1
         self._first_updates = min(_FIRST_UPDATES, self._all_updates)
-        self._per_device = 0
-        self.waiting: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
-        self._slow: collections.deque[tuple[Key, ChunkPair]] = collections.deque()
+        # Number of pairs of a chunk per device; 0 before the first.
+        self.per_device = 0
+        self.waiting: collections.deque[tuple[Any, ChunkPair]] = collections.deque()
+        self._slow: collections.deque[tuple[Any, ChunkPair]] = collections.deque()
         # Number of chunks for which slow pairs have waited.
         self._chunks_waited = 0
-        self._dispatched: collections.deque[tuple[list[tuple[Key, ChunkPair]], bool, Any]] = collections.deque()
+        self._dispatched: collections.deque[tuple[list[tuple[Any, ChunkPair]], bool, Any]] = collections.deque()
 
-    def _largest(self) -> int:
+    def largest(self) -> int:
         """The largest number of pairs of a chunk per device."""
         if self._mesh.devices[0].platform == "cpu":
             return _SIZE_ON_CPU
@@ -175,16 +167,13 @@ class _Group(Generic[Key]):
         most = min(_ROWS, 0.5 * free / _MEMORY_PER_ROW)
         return max(size for size in _SIZES if size * rows <= most or size == _SIZES[0])
 
-    def is_full(self) -> bool:
-        return len(self.waiting) >= (self._per_device or self._largest()) * self._mesh.size
-
-    def finish(self) -> Iterator[Ended[Key] | Refused[Key]]:
+    def finish(self) -> Iterator[Ended | Refused]:
         while self.waiting or self._slow or self._dispatched:
             yield from self.run()
 
-    def run(self) -> Iterator[Ended[Key] | Refused[Key]]:
+    def run(self) -> Iterator[Ended | Refused]:
         """Dispatch a chunk, if pairs wait, and yield the results of the oldest one if enough are dispatched."""
-        ended: list[Ended[Key] | Refused[Key]] = []
+        ended: list[Ended | Refused] = []
         try:
             waits = bool(self.waiting or (self._slow and not self._dispatched))
             if waits:
@@ -195,24 +184,24 @@ class _Group(Generic[Key]):
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
             begun = [pair for pairs, *_ in self._dispatched for pair in pairs]
-            if self._per_device == 1:
+            if self.per_device == 1:
                 rows = " and ".join(str(cloud.valid.size) for cloud in begun[0][1][2:])
                 raise MemoryError(
                     f"the memory of the device does not suffice for a pair padded to {rows} points; average the points "
                     "in larger voxels, or use KDTreeSearch()"
                 ) from error
-            self._per_device //= 2
+            self.per_device //= 2
             self.waiting.extendleft(reversed(begun))
             self._dispatched.clear()
         yield from ended
 
     def _dispatch(self) -> list[Any]:
         """Start the program for the next pairs, or refuse them; copies of the last one fill up the chunk."""
-        if not self._per_device:
-            most = self._largest()
+        if not self.per_device:
+            most = self.largest()
             wanted = -(-len(self.waiting) // self._mesh.size)
-            self._per_device = next((size for size in _SIZES if wanted <= size < most), most)
-        size = self._per_device * self._mesh.size
+            self.per_device = next((size for size in _SIZES if wanted <= size < most), most)
+        size = self.per_device * self._mesh.size
         late = len(self._slow) >= size or self._chunks_waited >= _CHUNKS_BETWEEN
         first = bool(self.waiting) and not late
         self._chunks_waited = self._chunks_waited + 1 if first and self._slow else 0
@@ -237,7 +226,7 @@ class _Group(Generic[Key]):
         pairs, first, packed = self._dispatched[0]
         leaves, structure = jax.tree.flatten(jax.device_get(packed).tree)
         self._dispatched.popleft()
-        ended: list[Ended[Key] | Refused[Key]] = []
+        ended: list[Ended | Refused] = []
         for (key, pair), *row in zip(pairs, *leaves, strict=False):
             state, assessment, history, check = jax.tree.unflatten(structure, row)
             if state.status < 0:
@@ -260,23 +249,14 @@ def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
 @with_settings_of_package
 @partial(jax.jit, static_argnames=("options", "num_neighbors", "covariances", "mesh"))
 def _registered(
-    chunk: ChunkPair,
-    max_updates: Int[Array, ""],
-    *,
-    method: AbstractMethod,
-    robust: AbstractKernel | None,
-    numbers: dict[str, Any],
-    search: AbstractSearch,
-    options: Options,
-    num_neighbors: int,
-    covariances: bool,
-    mesh: Mesh,
+    chunk: ChunkPair, common: tuple[Any, ...], options: Options, num_neighbors: int, covariances: bool, mesh: Mesh
 ) -> Packed[tuple[State, Assessment, Record, Any]]:
     """States, assessments, histories, and settings and fits for `doubt_of_start`, of stacked pairs, packed; a status is
-    negative where a loop has not ended after `max_updates`. `numbers` are the options that are numbers."""
+    negative where a loop has not ended after `max_updates`. `common`: the method, the kernel, the options that are
+    numbers, `max_updates` and the search."""
 
     def registered(pair: ChunkPair, common: Any) -> Any:
-        method, robust, numbers, max_updates = common
+        method, robust, numbers, max_updates, search = common
         complete = replace(options, **numbers | {"max_coarse_distance": pair.max_coarse_distance})
         source, target = pair.source, pair.target
         if method.uses_channels:
@@ -286,10 +266,11 @@ def _registered(
         executor = TracedExecutor(problem, search, options.max_iterations)
         loop = executor.run(max_updates)
         check = (problem.settings, surface_fit(inputs, executor, loop)) if complete.has_two_distances else None
-        assessment = assess(loop, problem, search) if covariances else Assessment.without_covariance(loop.state)
+        assessment = assess(loop, problem, search) if covariances else assessment_of(executor, loop, False)
         return loop.state, assessment, loop.history, check
 
     def on_a_device(chunk: ChunkPair, common: Any) -> Any:
+        *_, search = common
         find = partial(traced_neighbors, num_neighbors=num_neighbors, search=search)
         for name in ("source", "target"):
             clouds = getattr(chunk, name)
@@ -299,7 +280,6 @@ def _registered(
                 chunk = chunk._replace(**{name: clouds.replace_rows(deferred_neighbors=DeferredRows.of(neighbors))})
         return Packed.of(jax.vmap(registered, (0, None))(chunk, common))
 
-    common = method, robust, numbers, max_updates
     if mesh.size == 1:
         return on_a_device(chunk, common)
     # No device waits for the loops of the others.

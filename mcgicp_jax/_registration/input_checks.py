@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from jax.typing import ArrayLike
 
 from mcgicp_jax._clouds.point_cloud import LARGEST, PointCloud, same_channels
 from mcgicp_jax._clouds.voxel_size import raw_spacing
@@ -80,11 +81,7 @@ def check_channels(source: PointCloud, target: PointCloud, method: AbstractMetho
 
 
 def check_matches(
-    matches: Correspondences,
-    source: PointCloud,
-    target: PointCloud,
-    method: AbstractMethod,
-    temperature: ArrayLike | None,
+    matches: Correspondences, source: PointCloud, target: PointCloud, method: AbstractMethod, temperature: Any
 ) -> None:
     """Raise unless there is one match per source row, or several for a method that uses several or a `temperature`."""
     if not isinstance(matches, Correspondences):
@@ -162,10 +159,8 @@ def warn_of_estimated_parameters(
             "equalize_channels: gain and offset are estimated from the channels, but constant in the derivative by "
             "channels, which is therefore not that of the result; equalise the channels before"
         )
-    if not isinstance(method, MultiChannelGICP):
-        return
     names = ["channel_covariance", "channel_weights"] if soft else ["channel_covariance"]
-    unset = [name for name in names if getattr(method, name) is None]
+    unset = [name for name in names if isinstance(method, MultiChannelGICP) and getattr(method, name) is None]
     if unset:
         warn(
             f"{' and '.join(unset)}: estimated from the channels, but constant in the derivative by channels, which is "
@@ -192,22 +187,18 @@ def warn_of_lengths(source: PointCloud, target: PointCloud) -> None:
         # A tenth of the time of `np.quantile`.
         ordered, outside = np.sort(points, axis=0).astype(np.float64), len(points) // _OUTSIDE
         extents.append(float((ordered[-1 - outside] - ordered[outside]).max()) if len(points) else 0.0)
-    if not _differ(extents):
+    if not 0 < min(extents) < max(extents) / _OTHER_LENGTHS:
         return
     # More costly for raw clouds.
     spacings = [
         raw_spacing(cloud) if cloud.deferred_neighbors is None else float(point_spacing(cloud)) for cloud in clouds
     ]
-    if _differ(spacings) and (extents[0] < extents[1]) == (spacings[0] < spacings[1]):
+    differ = 0 < min(spacings) < max(spacings) / _OTHER_LENGTHS
+    if differ and (extents[0] < extents[1]) == (spacings[0] < spacings[1]):
         warn(
             f"points: the source extends over {extents[0]:.2g} with a spacing of {spacings[0]:.2g}, the target over "
             f"{extents[1]:.2g} with a spacing of {spacings[1]:.2g}; are both in the same unit, metres?"
         )
-
-
-def _differ(lengths: list[float]) -> bool:
-    least, largest = sorted(lengths)
-    return 0 < least < largest / _OTHER_LENGTHS
 
 
 def warn_of_inputs(source: PointCloud, target: PointCloud, method: AbstractMethod, equalize_channels: bool) -> None:

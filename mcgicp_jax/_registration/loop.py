@@ -29,24 +29,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._math.poses import move_pose, units
+from mcgicp_jax._math import poses
 from mcgicp_jax._methods.surfaces import AnySurface
+from mcgicp_jax._pose_solver import pose_measurements
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import first_force, fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot
 from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, sample_of_term
-from mcgicp_jax._pose_solver.pose_measurements import (
-    Fusion,
-    PoseMeasurements,
-    Prior,
-    constraints_at,
-    with_fixed_directions,
-)
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseMeasurements, Prior
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import Update, rounding, solve_update
 from mcgicp_jax._registration.result import Status
-from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED, Settings
+from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED, Settings, either
 from mcgicp_jax._search.base import SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm, is_adaptive
 
@@ -107,19 +102,18 @@ class Problem(eqx.Module):
         status = numpy_for(coarse).where(coarse, np.int32(COARSE), np.int32(RUNNING))
         return State(self.start, status, np.int32(0), np.zeros(6, dtype), np.zeros((), dtype))
 
-    def terms_at(self, status: Int[AnyScalar, ""], terms: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        """The terms as they act at this status: kernels are wide in the coarse phase, if they are to be widened."""
-        if not self.widens_kernels:
-            return terms
-        factor = self.settings.kernel_width(status)
+    def widened(self, terms: tuple[AbstractTerm, ...], status: Int[AnyScalar, ""]) -> tuple[AbstractTerm, ...]:
+        """The terms with kernels that are wide in the coarse phase: residuals grow with the distance of the matches,
+        and a kernel that redescends would ignore all that could move the pose."""
+        width = either(status == COARSE, self.settings.max_distance / self.settings.fine_distance, 1.0)
 
-        def widened(term: AbstractTerm) -> AbstractTerm:
-            if term.robust is None:
-                return term
-            scale = numpy_for(term.robust.scale, factor).asarray(term.robust.scale) * factor
-            return eqx.tree_at(lambda term: term.robust.scale, term, scale)
+        def scaled(scale: Any) -> AnyScalar:
+            return numpy_for(scale, width).asarray(scale) * width
 
-        return tuple(map(widened, terms))
+        return tuple(
+            term if term.robust is None else eqx.tree_at(lambda term: term.robust.scale, term, replace_fn=scaled)
+            for term in terms
+        )
 
 
 class Record(NamedTuple):
@@ -160,7 +154,7 @@ class LoopResult(NamedTuple):
     """The loop after some steps.
 
     Attributes:
-        matches: at the pose before the last update; None before the first.
+        matches: at the pose before the last update; None before the first, unless they are given.
         terms: as they were at that pose.
         history: records of the steps; arrays with one entry for each possible step inside transformations.
     """
@@ -176,7 +170,7 @@ class AbstractExecutor(abc.ABC):
     module level; they map a `Motion`, `Matched` and further arguments to a pytree of arrays."""
 
     def __init__(self, problem: Problem):
-        self.problem = problem
+        self.problem, self._adapts = problem, is_adaptive(problem.terms)
 
     @abc.abstractmethod
     def run(self) -> LoopResult:
@@ -185,16 +179,16 @@ class AbstractExecutor(abc.ABC):
     def step(self, loop: LoopResult) -> LoopResult:
         """One step: find matches at this pose; sum their forces; update the pose."""
         state = loop.state
-        matches = self.match(state, loop.matches)
-        terms = self.adapt(state, matches, loop.terms)
-        acting = self.problem.terms_at(state.status, terms)
+        matches = self.match(state, loop.matches) if self.problem.matches is None else loop.matches
+        terms = self.adapt(state, matches, loop.terms) if self._adapts else loop.terms
+        acting = self.problem.widened(terms, state.status) if self.problem.widens_kernels else terms
         sums = self.sums(Motion.of(state.pose.wxyz_xyz), matches, acting, state.status == SETTLED)
         # The sums are not an output of the compiled update, which would copy them.
         return LoopResult(self.update(state, sums)._replace(sums=sums), matches, terms, loop.history)
 
     @abc.abstractmethod
     def match(self, state: State, before: Any) -> Matches:
-        """The matches at the pose of a state. If its status is `SETTLED`, the previous matches, `before`."""
+        """The matches found at the pose of a state. If its status is `SETTLED`, the previous matches, `before`."""
 
     @abc.abstractmethod
     def nearest(
@@ -224,17 +218,14 @@ class AbstractExecutor(abc.ABC):
         """`scores_of` all correspondences; further arguments are those of that function."""
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        """The terms, their numbers estimated from a sample of the matches; outside the fine phase, those `before`."""
-        terms = self.problem.terms
-        if not is_adaptive(terms):
-            return terms
-        motion, valid = Motion.of(state.pose.wxyz_xyz), self.source_of(matches).valid
-        return adapted(terms, valid, lambda term, rows: self.rows(sample_of_term, motion, matches.some(rows), term))
+        """Adaptive terms with numbers estimated from a sample of the matches; outside the fine phase, `before`."""
+        motion, valid = Motion.of(state.pose.wxyz_xyz), self.problem.source.search.valid
+        valid = valid if matches.rows is None else valid[matches.rows]
 
-    def source_of(self, matches: Matches) -> SearchPoints:
-        """The source points that have these matches: in the coarse phase on the host, every `coarse_stride`-th."""
-        source = self.problem.source.search
-        return source if matches.rows is None else jax.tree.map(lambda array: array[matches.rows], source)
+        def sample(term: AbstractTerm, rows: Int[AnyArray, "n"]) -> Any:
+            return self.rows(sample_of_term, motion, matches.some(rows), term)
+
+        return adapted(self.problem.terms, valid, sample)
 
     def rematched(
         self, pose: jaxlie.SE3, shift: Float[AnyArray, "3"], rows: Int[AnyArray, "n"], counts: Bool[AnyArray, "n"]
@@ -279,8 +270,10 @@ def _change(
     directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
     degenerate: AnyScalar = np.bool_(False)
     if sums.observability is not None:
-        constraints = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
-        directions = find_directions(sums, constraints)
+        by_prior = None
+        if fixed is not None:
+            by_prior = pose_measurements.constraints_at(pose, sums.center, sums.radius, fixed)
+        directions = find_directions(sums, by_prior)
         degenerate = ~jnp.all(directions.constrained)
         # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
         moving = (directions.constrained | ~settings.hold_unconstrained) & ~directions.fixed
@@ -315,8 +308,8 @@ def update(
     deviation, estimated as if residuals were independent, which is smaller than that of the pose.
     """
     change, directions, degenerate = _change(pose, sums, settings, measurements, fixed)
-    moved = move_pose(pose, change.twist, sums.center)
-    moved = moved if fixed is None else with_fixed_directions(moved, fixed)
+    moved = poses.move_pose(pose, change.twist, sums.center)
+    moved = moved if fixed is None else pose_measurements.with_fixed_directions(moved, fixed)
     coarse, settled = status == COARSE, status == SETTLED
     since = since + change.twist
     sizes = jnp.linalg.norm(jnp.stack([change.twist, since]).reshape(2, 2, 3), axis=2)
@@ -325,7 +318,7 @@ def update(
     def below(translation: Float[AnyScalar, ""], rotation: Float[AnyScalar, ""]) -> Bool[Array, ""]:
         return (translation_step <= translation) & (rotation_step <= rotation)
 
-    motion_since = since / units(sums.radius)
+    motion_since = since / poses.units(sums.radius)
     extent = jnp.maximum(extent, motion_since @ change.information @ motion_since * sums.radius**2)
     returned = (translation_since <= settings.translation_tolerance) & (rotation_since <= settings.rotation_tolerance)
     cycles = (status == RUNNING) & returned & (extent * sums.count <= sums.cost)

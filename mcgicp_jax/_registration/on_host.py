@@ -18,10 +18,9 @@ from mcgicp_jax._compute.tables import Packed
 from mcgicp_jax._pose_solver.covariance import Scores, scores_of
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, of_matches
-from mcgicp_jax._pose_solver.pose_measurements import PoseMeasurements, Prior
 from mcgicp_jax._pose_solver.sums import Sums, combine, sums_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Problem, Record, State, update
-from mcgicp_jax._registration.settings import COARSE, SETTLED, Settings
+from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED, Settings, either
 from mcgicp_jax._search.base import AbstractIndex, SearchPoints, by_position
 from mcgicp_jax._terms.base import AbstractTerm
 
@@ -38,7 +37,8 @@ class HostExecutor(AbstractExecutor):
         self._settings = Packed.of(problem.settings, num_axes=0)
 
     def run(self) -> LoopResult:
-        loop, history = LoopResult(self.problem.first_state, None, self.problem.terms, None), []
+        problem, history = self.problem, []
+        loop = LoopResult(problem.first_state, problem.matches, problem.terms, None)
         while loop.state.status < 0:
             loop = self.step(loop)
             history.append(loop.state.record)
@@ -50,39 +50,36 @@ class HostExecutor(AbstractExecutor):
 
     def match(self, state: State, before: Any) -> Matches:
         status, settings, problem = state.status, self.problem.settings, self.problem
-        if problem.matches is not None:
-            return problem.matches
         if status == SETTLED:
             return before
         stride = int(settings.stride(status, state.num_iterations))
         alone = bool(status != COARSE and any(map(attrgetter("by_position"), problem.terms)))
         source: SearchPoints = problem.source.search
-        rows = None if stride == 1 else np.arange(problem.source.num_points)[::stride]
+        rows = None
         if stride > 1:
+            rows = np.arange(problem.source.num_points)[::stride]
             source = jax.tree.map(lambda array: array[::stride], source)
         if self._follow is None or (stride, alone) != self._followed:
             followed = jax.tree.map(np.ascontiguousarray, by_position(source) if alone else source)
-            follow = self._index_of(alone).follow
-            self._follow = follow(followed, float(settings.max_distance), problem.num_candidates)
-            self._followed = stride, alone
+            index, limit = self._index_of(alone), float(settings.max_distance)
+            self._follow, self._followed = index.follow(followed, limit, problem.num_candidates), (stride, alone)
         indices = self._follow(state.pose.wxyz_xyz)
-        return Matches.of(source, problem.target.search, indices, settings.distance(status), rows)
+        limit = either(status == COARSE, settings.max_distance, settings.fine_distance)
+        return Matches.of(source, problem.target.search, indices, limit, rows)
 
     def nearest(
         self, pose: Float[np.ndarray, "7"], source: SearchPoints, alone: bool = True, num_candidates: int = 1
     ) -> Int[np.ndarray, "m n"]:
-        limit = float(self.problem.settings.fine_distance)
-        return self._index_of(alone).nearest(pose, source, limit, num_candidates)
+        return self._index_of(alone).nearest(pose, source, float(self.problem.settings.fine_distance), num_candidates)
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        return before if state.status in (COARSE, SETTLED) else super().adapt(state, matches, before)
+        return super().adapt(state, matches, before) if state.status == RUNNING else before
 
     def rows(
         self, function: Callable[..., Any], motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False
     ) -> Any:
         applied = self._over(function, motion, matches, arguments, with_noise, total=False)
-        (rows,) = applied.rows(None, self._num_threads if with_noise else 1)
-        return rows.tree
+        return applied.rows(None, self._num_threads if with_noise else 1)[0].tree
 
     def _over(
         self, function: Any, motion: Motion, matches: Matches, arguments: Any, with_noise: bool, total: bool = True
@@ -98,14 +95,14 @@ class HostExecutor(AbstractExecutor):
         with_slopes = bool(last) and self.problem.source.observes_channels
         arguments = terms, self.problem.settings.near, np.bool_(last)
         applied = self._over(sums_of, motion, matches, arguments, with_slopes)
-        parts: list[Packed[Sums]] = applied.sums(self._num_threads if with_slopes else 1)
-        if len(parts) == 1:
-            return parts[0]
-        tables, dtype = np.stack([part.table for part in parts]), parts[0].table.dtype
+        first, *others = applied.sums(self._num_threads if with_slopes else 1)
+        if not others:
+            return first
+        tables = np.stack([part.table for part in (first, *others)])
         with np.errstate(over="ignore"):
-            sums = combine(Packed(tables.astype(np.float64), parts[0].layout).tree)
-            table = np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(sums)]).astype(dtype)
-        return Packed(table, parts[0].layout)
+            sums = combine(Packed(tables.astype(np.float64), first.layout).tree)
+            table = np.concatenate([leaf.ravel() for leaf in jax.tree.leaves(sums)]).astype(tables.dtype)
+        return Packed(table, first.layout)
 
     def update(self, state: State, sums: Packed[Sums]) -> State:
         updated = _update(state[:5], sums, self._settings, self.problem.measurements, self.problem.fixed)
@@ -129,11 +126,5 @@ class HostExecutor(AbstractExecutor):
 
 
 @partial(quickly_compiled, level=1)
-def _update(
-    state: tuple[Any, ...],
-    sums: Packed[Sums],
-    settings: Packed[Settings],
-    measurements: PoseMeasurements | None,
-    fixed: Prior | None,
-) -> Packed[State]:
-    return Packed.of(update(*state, sums.tree, settings.tree, measurements, fixed), num_axes=0)
+def _update(state: tuple[Any, ...], sums: Packed[Sums], settings: Packed[Settings], *measured: Any) -> Packed[State]:
+    return Packed.of(update(*state, sums.tree, settings.tree, *measured), num_axes=0)

@@ -26,9 +26,9 @@ Distance: TypeAlias = ArrayLike | tuple[ArrayLike, ArrayLike]
 # Radians. Above the small cycles in which nearest-neighbour matching often ends: with real scans of 0.1 m spacing,
 # these were seen to stay within 0.2 mm and 0.4 mrad. The default translation tolerance is chosen likewise.
 ROTATION_TOLERANCE = 5e-4
-# Default `max_source_points`. With every third point, mean errors were those
-# of all points within 4 % (scans of KITTI with 34,000 points, RGB-D with 7,500); with every tenth, up to 36 % larger.
-_ENOUGH_SOURCE_POINTS = 10_000
+# With every third point, mean errors were those of all points within 4 % (scans of KITTI with 34,000 points, RGB-D with
+# 7,500); with every tenth, up to 36 % larger.
+_MAX_SOURCE_POINTS = 10_000
 
 
 @dataclass(frozen=True)
@@ -46,34 +46,33 @@ class Options:
     hold_unconstrained: ArrayLike = True
     equalize_channels: bool = False
     voxel_sizes: Sequence[float] = ()
-    max_source_points: int | None = _ENOUGH_SOURCE_POINTS
+    max_source_points: int | None = _MAX_SOURCE_POINTS
     soft_matches: bool | None = None
     min_coarse_distance: float = 0.0
     max_coarse_distance: Any = np.inf
 
     def __post_init__(self) -> None:
-        for name, number in self.numbers.items():
-            object.__setattr__(self, name, primal(number))
+        for name, number in primal(self.numbers).items():
+            object.__setattr__(self, name, number)
         distances: Any = self.max_distance
         if distances is not None and np.shape(distances) != (2,):
             check_positive("max_distance", distances, "one or two positive numbers")
         elif distances is not None and is_concrete(distances):
             coarse, fine = distances
             if not (is_number(coarse) and is_number(fine) and coarse >= fine > 0):
-                raise ValueError(
-                    f"max_distance: expected two positive numbers, the larger one first, got {distances!r}"
-                )
+                expected = "two positive numbers, the larger one first"
+                raise ValueError(f"max_distance: expected {expected}, got {distances!r}")
         check_integer("max_iterations", self.max_iterations, 1)
-        for name in ("translation_tolerance", "rotation_tolerance"):
-            value = getattr(self, name)
-            if name == "translation_tolerance" and value is None:
-                continue
-            if is_concrete(value) and not (is_number(value) and np.asarray(value) >= 0):
+        tolerances = {
+            "translation_tolerance": self.translation_tolerance,
+            "rotation_tolerance": self.rotation_tolerance,
+        }
+        for name, value in tolerances.items():
+            optional = name == "translation_tolerance" and value is None
+            if not optional and is_concrete(value) and not (is_number(value) and np.asarray(value) >= 0):
                 raise ValueError(f"{name}: expected a number of at least 0, got {value!r}")
-        for name, kind, example in (
-            ("robust", AbstractKernel, "Huber(1.0)"),
-            ("search", AbstractSearch, "KDTreeSearch()"),
-        ):
+        classes = ("robust", AbstractKernel, "Huber(1.0)"), ("search", AbstractSearch, "KDTreeSearch()")
+        for name, kind, example in classes:
             value = getattr(self, name)
             if isinstance(value, type) and issubclass(value, kind):
                 raise ValueError(f"{name}: expected an object such as {example}, got the class {value.__name__}")
@@ -98,12 +97,8 @@ class Options:
     @property
     def numbers(self) -> dict[str, Any]:
         """The options that may be arrays, constants to autodiff."""
-        return {
-            "max_distance": self.max_distance,
-            "translation_tolerance": self.translation_tolerance,
-            "rotation_tolerance": self.rotation_tolerance,
-            "hold_unconstrained": self.hold_unconstrained,
-        }
+        names = "max_distance", "translation_tolerance", "rotation_tolerance", "hold_unconstrained"
+        return {name: getattr(self, name) for name in names}
 
     @property
     def has_two_distances(self) -> bool:
@@ -133,9 +128,8 @@ class GivenOptions(TypedDict, total=False):
 
 def options_of(function: Callable[..., Any], options: Any) -> Options:
     """The options of `register` given to another function; raises `TypeError` for a name that neither function has."""
-    parameters = inspect.signature(function).parameters.values()
-    named = [parameter.name for parameter in parameters if parameter.kind is not inspect.Parameter.VAR_KEYWORD]
-    names = list(dict.fromkeys([*GivenOptions.__annotations__, *named]))
+    # Without the name of `**options`, which is the last one.
+    names = list(dict.fromkeys([*GivenOptions.__annotations__, *list(inspect.signature(function).parameters)[:-1]]))
     for name in options.keys() - names:
         close = difflib.get_close_matches(name, names)
         hint = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(sorted(names))}"

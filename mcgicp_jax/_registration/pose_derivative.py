@@ -28,17 +28,12 @@ from mcgicp_jax._math.poses import parameters_by_twist, translation_adjoint, tur
 from mcgicp_jax._math.robust_kernels import AbstractKernel
 from mcgicp_jax._methods.base import AbstractMethod, with_unset_from
 from mcgicp_jax._methods.surfaces import differentiable_inputs
-from mcgicp_jax._pose_solver.implicit_derivative import (
-    MAX_NEWTON_STEPS,
-    ImplicitRoot,
-    moved_along,
-    score_at,
-    value_and_jacobian,
-)
+from mcgicp_jax._pose_solver import implicit_derivative
+from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot
 from mcgicp_jax._pose_solver.matched import Motion, matched_rows
 from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseForm, Prior, TiePoints, form_at
-from mcgicp_jax._registration.loop import LoopResult, State, root_of
-from mcgicp_jax._registration.on_host import HostExecutor
+from mcgicp_jax._registration.loop import LoopResult, Problem, State, root_of
+from mcgicp_jax._search.base import AbstractSearch
 from mcgicp_jax._terms.base import with_numbers_of
 
 
@@ -69,14 +64,27 @@ class Inputs(NamedTuple):
         return self if is_concrete(self) else Inputs(*map(primal, self))
 
 
+class Run(NamedTuple):
+    """A registration that has ended.
+
+    `loop` is constant to autodiff, and so are `inputs` outside `jit`. `executor` is a `HostExecutor`; None inside
+    `jit`. `doubt` says why a pose is UNVERIFIED, outside `jit`.
+    """
+
+    inputs: Inputs
+    problem: Problem
+    loop: LoopResult
+    search: AbstractSearch | None
+    executor: Any
+    doubt: str = ""
+
+
 class PoseDerivative(AbstractLinearMap):
     """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of a final pose, 0 if there is none, by `arrays` among the
-    `inputs`; by default, by all that are traced. `fixed` are the same inputs, concrete."""
+    `inputs`; by default, by all that are traced. Those of `run` are the same inputs, concrete."""
 
-    def __init__(
-        self, inputs: Inputs, fixed: Inputs, executor: HostExecutor, loop: LoopResult, arrays: Sequence[Any] = ()
-    ):
-        problem = executor.problem
+    def __init__(self, inputs: Inputs, run: Run, arrays: Sequence[Any] = ()):
+        fixed, problem, loop = run[:3]
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
         root = _root_on_host(loop.state._replace(record=None), self._fusion)
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root)
@@ -88,7 +96,7 @@ class PoseDerivative(AbstractLinearMap):
         self._form = jax.tree.leaves(form)
         equalized = any(term.estimates_gains for term in problem.terms)
         terms = inputs.method.terms(fixed.source, fixed.target, inputs.robust, equalized)
-        matches = executor.differentiable_matches(loop)
+        matches = run.executor.differentiable_matches(loop)
         tables = differentiable_inputs(
             *inputs[:3],
             terms,
@@ -143,9 +151,14 @@ class PoseDerivative(AbstractLinearMap):
     def _root(self) -> tuple[Float[np.ndarray, "7"], Float[np.ndarray, "6 6"], Float[np.ndarray, "6"]]:
         """The root near the final pose, by Newton's method, and P (Pᵀ ∂g/∂ξ P)⁻¹ Pᵀ and g there; 0 if there is none."""
         pose, root = self._pose, self._scaling
-        for _ in range(MAX_NEWTON_STEPS if root.usable else 0):
+        for _ in range(implicit_derivative.MAX_NEWTON_STEPS if root.usable else 0):
             score, by_motion = self._scored.at(Motion.of(pose)).value_and_jacobian((0, 1))
-            slopes = np.column_stack([slope.reshape(6, -1) for slope in by_motion]) @ self._motion_by_twist(pose)
+            # Derivative of rotation matrix and translation by a twist.
+            rotation, by_twist = Motion.of(pose.astype(np.float64)).rotation, self._by_twist(pose)
+            motion_by_twist = np.zeros((12, 6))
+            motion_by_twist[:9, 3:] = np.cross(np.eye(3)[:, :, None], rotation[None], axis=1).reshape(3, 9).T
+            motion_by_twist[9:] = by_twist[4:]
+            slopes = np.column_stack([slope.reshape(6, -1) for slope in by_motion]) @ motion_by_twist
             both = np.column_stack([score, slopes])
             if self._fusion is not None:
                 both = np.asarray(_balance_and_slope(pose, root, self._fusion, both.astype(pose.dtype)), np.float64)
@@ -155,7 +168,7 @@ class PoseDerivative(AbstractLinearMap):
                 break
             inverse = np.asarray(root.columns @ np.linalg.inv(within) @ root.rows)
             twist = -(inverse @ balance)[:, 0]
-            moved = pose + self._by_twist(pose) @ twist
+            moved = pose + by_twist @ twist
             moved[:4] /= np.linalg.norm(moved[:4])
             pose = moved.astype(pose.dtype)
             # Convergence is quadratic: after a step below √eps the remaining error is rounding.
@@ -168,18 +181,10 @@ class PoseDerivative(AbstractLinearMap):
         lengths = np.array([self._scaling.radius] * 3 + [1.0] * 3)
         return parameters_by_twist(pose.astype(np.float64), np.asarray(self._scaling.center)) * lengths
 
-    def _motion_by_twist(self, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "12 6"]:
-        """Derivative of rotation matrix and translation by the same twist."""
-        rotation = Motion.of(pose.astype(np.float64)).rotation
-        slope = np.zeros((12, 6))
-        slope[:9, 3:] = np.cross(np.eye(3)[:, :, None], rotation[None], axis=1).reshape(3, 9).T
-        slope[9:] = self._by_twist(pose)[4:]
-        return slope
-
 
 def _score_of_rows(numbers: tuple[Motion, ImplicitRoot, Any, Any], *rows: Rows) -> Float[Array, "6"]:
     motion, root, terms, temperature = numbers
-    return score_at(motion, root, matched_rows(rows, temperature), terms)
+    return implicit_derivative.score_at(motion, root, matched_rows(rows, temperature), terms)
 
 
 @quickly_compiled
@@ -189,75 +194,56 @@ def _balance_and_slope(
     """The equation with tie points and a prior, and its derivative by a twist, from those of the matches, g first."""
 
     def balance(twist: Float[Array, "6"]) -> Float[Array, "6"]:
-        return fusion.balance(matches[:, 0] + matches[:, 1:] @ twist, moved_along(twist, pose, root))
+        motion = implicit_derivative.moved_along(twist, pose, root)
+        return fusion.balance(matches[:, 0] + matches[:, 1:] @ twist, motion)
 
-    value, slope = value_and_jacobian(balance, jnp.zeros_like(pose[:6]))
+    value, slope = implicit_derivative.value_and_jacobian(balance, jnp.zeros_like(pose[:6]))
     return jnp.concatenate([value[:, None], slope], axis=1)
 
 
 @quickly_compiled
 def _vjp_of_balance(
-    pose: Float[Array, "7"],
-    root: ImplicitRoot,
-    fusion: Fusion,
-    score: Float[Array, "6"],
-    cotangents: Float[Array, "m 6"],
+    pose: Float[Array, "7"], root: ImplicitRoot, fusion: Fusion, score: Float[Array, "6"], rows: Float[Array, "m 6"]
 ) -> tuple[Float[Array, "m 6"], PoseForm]:
     def balance(score: Float[Array, "6"], form: PoseForm) -> Float[Array, "6"]:
-        motion = moved_along(jnp.zeros_like(score), pose, root)
+        motion = implicit_derivative.moved_along(jnp.zeros_like(score), pose, root)
         return eqx.tree_at(lambda fusion: fusion.form, fusion, form).balance(score, motion)
 
     _, vjp = jax.vjp(balance, score, fusion.form)
-    return jax.vmap(vjp)(cotangents)
+    return jax.vmap(vjp)(rows)
 
 
 @with_settings_of_package
-def jacobian(
-    inputs: Inputs, executor: HostExecutor, loop: LoopResult, cloud: str, field: str
-) -> Float[np.ndarray, "6 ..."]:
+def jacobian(run: Run, cloud: str, field: str) -> Float[np.ndarray, "6 ..."]:
     """The derivative of the final pose by an array of a cloud, see `RegistrationResult.jacobian`."""
-    side: Any = getattr(inputs, cloud)
+    side: Any = getattr(run.inputs, cloud)
     array = getattr(side, field)
     if array is None:
         raise ValueError(f"{field}: expected a {cloud} that has some, got None")
     # Arrays are told apart by identity, and the clouds may share this one: a view is another array.
     array = np.asarray(array).view()
-    given = inputs._replace(**{cloud: side.replace_rows(**{field: array})})
-    (by_array,) = parameters_by(given, inputs, executor, loop, [array])
+    given = run.inputs._replace(**{cloud: side.replace_rows(**{field: array})})
+    (by_array,) = parameters_by(given, run, [array])
     if field == "channels":
         # Those that move with the sensor were replaced by 0.
         by_array = by_array * np.any(array, axis=0)
-    pose, rotation = np.asarray(loop.state.pose.wxyz_xyz, np.float64), Motion.of(loop.state.pose.wxyz_xyz).rotation
+    parameters = run.loop.state.pose.wxyz_xyz
+    pose, rotation = np.asarray(parameters, np.float64), Motion.of(parameters).rotation
     twist = np.zeros((6, 7))
     twist[:3, 4:], twist[3:, :4] = rotation.T, rotation.T @ turn_by_quaternion(pose[:4])
-    return np.tensordot(translation_adjoint(np.asarray(inputs.source.origin)) @ twist, by_array, 1)
+    return np.tensordot(translation_adjoint(np.asarray(run.inputs.source.origin)) @ twist, by_array, 1)
 
 
-def parameters_by(
-    given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult, arrays: Sequence[Any]
-) -> list[Float[np.ndarray, "7 ..."]]:
+def parameters_by(given: Inputs, run: Run, arrays: Sequence[Any]) -> list[Float[np.ndarray, "7 ..."]]:
     """The derivative of the parameters `jaxlie.SE3.wxyz_xyz` of the final pose by concrete arrays among the leaves of
-    `given`; `inputs` are the same as registered."""
-    channels, gains, equalized = given.source.channels, inputs.gains, None
-    registered = list(arrays)
+    `given`, the inputs of `run` as they were given."""
+    gains, equalized, registered = run.inputs.gains, None, list(arrays)
     if gains is not None:
-        equalized = np.asarray(inputs.source.channels).view()
-        registered = [equalized if array is channels else array for array in arrays]
-    derivative = PoseDerivative(_as_registered(given, inputs, equalized), inputs, executor, loop, registered)
+        equalized = np.asarray(run.inputs.source.channels).view()
+        registered = [equalized if array is given.source.channels else array for array in arrays]
+    derivative = PoseDerivative(_as_registered(given, run.inputs, equalized), run, registered)
     slopes = derivative.vjp([np.eye(7)], tuple(range(len(arrays))))
     return [slope * gains if moved is equalized else slope for slope, moved in zip(slopes, registered, strict=True)]
-
-
-def differentiated(given: Inputs, inputs: Inputs, executor: HostExecutor, loop: LoopResult) -> PoseDerivative | None:
-    """The derivative of the final pose by the traced arrays on which it depends; origins: see `pose_in_user_frame`."""
-    if is_concrete(given):
-        return None
-    channels = None if inputs.gains is None else inputs.source.channels
-    if channels is not None and not is_concrete(given.source.channels):
-        gains = np.asarray(inputs.gains, channels.dtype)
-        (channels,) = blockwise(_equalized, gains, Input(given.source.channels), Input(channels))
-    derivative = PoseDerivative(_as_registered(given, inputs, channels), inputs, executor, loop)
-    return derivative if derivative.arrays else None
 
 
 def _as_registered(given: Inputs, inputs: Inputs, channels: Any) -> Inputs:
@@ -276,14 +262,24 @@ _form_at = jax.jit(form_at)
 _root_on_host = quickly_compiled(root_of, level=0)
 
 
-def with_derivatives(states: Sequence[State], derivatives: Sequence[PoseDerivative | None]) -> list[State]:
-    """The final states; their poses have derivatives, which are computed side by side."""
-    present = {i: derivative for i, derivative in enumerate(derivatives) if derivative is not None}
-    if not present:
-        return list(states)
-    maps = list(present.values())
-    together = SideBySide(maps, [len(derivative.arrays) for derivative in maps])
-    values = [np.asarray(states[i].pose.wxyz_xyz) for i in present]
-    poses = with_derivative(values, together, [array for derivative in maps for array in derivative.arrays])
-    attached = {i: jaxlie.SE3(pose) for i, pose in zip(present, poses, strict=True)}
-    return [state._replace(pose=attached.get(i, state.pose)) for i, state in enumerate(states)]
+def with_derivatives(runs: Sequence[Run], givens: Sequence[Inputs]) -> list[State]:
+    """The final states. Poses have derivatives by the traced arrays of `givens` on which they depend, computed side by
+    side; origins: see `pose_in_user_frame`."""
+    states, derivatives = [run.loop.state for run in runs], dict[int, PoseDerivative]()
+    for i, (run, given) in enumerate(zip(runs, givens, strict=True)):
+        if is_concrete(given):
+            continue
+        channels = None if run.inputs.gains is None else run.inputs.source.channels
+        if channels is not None and not is_concrete(given.source.channels):
+            gains = np.asarray(run.inputs.gains, channels.dtype)
+            (channels,) = blockwise(_equalized, gains, Input(given.source.channels), Input(channels))
+        derivative = PoseDerivative(_as_registered(given, run.inputs, channels), run)
+        if derivative.arrays:
+            derivatives[i] = derivative
+    if derivatives:
+        maps, values = list(derivatives.values()), [np.asarray(states[i].pose.wxyz_xyz) for i in derivatives]
+        together = SideBySide(maps, [len(derivative.arrays) for derivative in maps])
+        poses = with_derivative(values, together, [array for derivative in maps for array in derivative.arrays])
+        for i, pose in zip(derivatives, poses, strict=True):
+            states[i] = states[i]._replace(pose=jaxlie.SE3(pose))
+    return states

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -19,14 +19,9 @@ from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
+from mcgicp_jax._local_geometry import sensor_patterns
 from mcgicp_jax._local_geometry.cloud_statistics import changes_of_exposure, with_channels_matched
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
-from mcgicp_jax._local_geometry.sensor_patterns import (
-    channels_may_move,
-    doubt_of_patterns,
-    without_constant_part,
-    without_patterns,
-)
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
@@ -34,38 +29,17 @@ from mcgicp_jax._methods.icp import GICP, PointToPoint
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import voxel_gaussians
 from mcgicp_jax._methods.surfaces import surface_pair, whole_surface
-from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Matches
+from mcgicp_jax._registration import input_checks, start_check, tie_points_and_prior
 from mcgicp_jax._registration.assessment import assessment_of, moments_of, registration_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
-from mcgicp_jax._registration.input_checks import (
-    check_channels,
-    check_clouds,
-    warn_of_extensions,
-    warn_of_hard_matches,
-    warn_of_inputs,
-)
-from mcgicp_jax._registration.loop import CONTRADICTION, LoopResult, Problem, squared_residuals
+from mcgicp_jax._registration.loop import CONTRADICTION, Problem, squared_residuals
 from mcgicp_jax._registration.on_host import HostExecutor
-from mcgicp_jax._registration.options import Options, check_method
-from mcgicp_jax._registration.pose_derivative import Inputs, differentiated, jacobian, with_derivatives
+from mcgicp_jax._registration.options import Options
+from mcgicp_jax._registration.pose_derivative import Inputs, Run, jacobian, with_derivatives
 from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status
 from mcgicp_jax._registration.settings import settings_for, spacing_of
-from mcgicp_jax._registration.start_check import (
-    LITTLE_IN_COMMON,
-    Candidate,
-    choice_of,
-    distance_moved,
-    doubt_of_start,
-    surface_fit,
-)
-from mcgicp_jax._registration.tie_points_and_prior import (
-    GivenPrior,
-    GivenTiePoints,
-    checked_measurements,
-    fusion_of,
-    measured,
-)
+from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.default_search import default_search
@@ -79,21 +53,6 @@ _COARSE_ROWS = 4096
 _COARSE_VOXEL = 0.25
 
 
-class Run(NamedTuple):
-    """A registration that has ended.
-
-    `loop` is constant to autodiff, and so are `inputs` outside `jit`. Inside `jit`, `executor` is None. `doubt` says
-    why a pose is UNVERIFIED, outside `jit`.
-    """
-
-    inputs: Inputs
-    problem: Problem
-    loop: LoopResult
-    search: AbstractSearch | None
-    executor: HostExecutor | None
-    doubt: str = ""
-
-
 @with_settings_of_package
 def register_pair(
     source: PointCloud | Values,
@@ -104,10 +63,9 @@ def register_pair(
     tie_points: GivenTiePoints | None = None,
     prior: GivenPrior | None = None,
 ) -> RegistrationResult:
-    given = prepared(source, target, method, options, tie_points, prior)
-    if init is None and prior is not None:
-        init = prior[0]
-    return result_of(given, run_pair, primal(init), options)
+    inputs = prepared(source, target, method, options, tie_points, prior)
+    init = prior[0] if init is None and prior is not None else init
+    return result_of(inputs, run_pair, primal(init), options)
 
 
 def result_of(given: Inputs, run: Callable[..., Run], *arguments: Any) -> RegistrationResult:
@@ -145,32 +103,30 @@ def prepared(
     channels_checked: bool = True,
 ) -> Inputs:
     """The arguments, checked; clouds are `preprocessed`, and if `channels_checked`, `without_sensor_patterns`."""
-    check_method(method)
     sides = {"source": as_cloud("source", source), "target": as_cloud("target", target)}
     source, target = preprocessed(sides, method, options)
     if options.soft_matches is False:
-        warn_of_hard_matches(method, source, target)
+        input_checks.warn_of_hard_matches(method, source, target)
     if channels_checked and method.uses_channels:
         source, target = without_sensor_patterns(source, target, method)
     if options.voxel_sizes and not (source.covariances is None and target.covariances is None):
         raise ValueError("voxel_sizes: expected none for clouds with covariances, which cannot be averaged in voxels")
     if options.voxel_sizes and not is_concrete(primal((source, target))):
-        raise ValueError(
-            "voxel_sizes: expected none inside jit and vmap, where preprocess(cloud, voxel_size, size=...) averages "
-            "points"
-        )
+        advice = "where preprocess(cloud, voxel_size, size=...) averages points"
+        raise ValueError(f"voxel_sizes: expected none inside jit and vmap, {advice}")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
         raise ValueError("voxel_sizes: expected none for derivatives with cells; make these with voxel_gaussians")
-    return Inputs(source, target, method, options.robust, *checked_measurements(tie_points, prior, source, target))
+    measurements = tie_points_and_prior.checked_measurements(tie_points, prior, source, target)
+    return Inputs(source, target, method, options.robust, *measurements)
 
 
 def without_sensor_patterns(
     source: PointCloud, target: PointCloud, method: AbstractMethod
 ) -> tuple[PointCloud, PointCloud]:
     """The clouds for a method that uses channels, without what moves with the sensor."""
-    source, target = without_patterns(source, target)
+    source, target = sensor_patterns.without_patterns(source, target)
     if isinstance(method, MultiChannelGICP) and method.photometric:
-        source, target = without_constant_part(source), without_constant_part(target)
+        return sensor_patterns.without_constant_part(source), sensor_patterns.without_constant_part(target)
     return source, target
 
 
@@ -183,11 +139,12 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     def solve(inputs: Inputs, init: Pose | None, options: Options = options) -> Run:
         problem, inputs = problem_of(inputs, init, options, search.num_threads)
         if measures:
-            problem = measured(problem, given.tie_points, given.prior, traced, limits=options.max_distance is None)
+            limits = options.max_distance is None
+            problem = tie_points_and_prior.measured(problem, given.tie_points, given.prior, traced, limits)
         return run_loop(inputs, problem, search, options.max_iterations, traced)
 
     if not traced:
-        warn_of_inputs(given.source, given.target, given.method, options.equalize_channels)
+        input_checks.warn_of_inputs(given.source, given.target, given.method, options.equalize_channels)
     equalizes = options.equalize_channels and given.source.channels.shape[-1] > 0
     *coarse, inputs = _at_scales(_equalized(given) if equalizes else given, options.voxel_sizes)
     start = init
@@ -197,8 +154,9 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     run = solve(inputs, start)
     doubt = ""
     if not traced and options.has_two_distances:
-        run, doubt = _unless_left(
-            run, init, len(coarse) > 0, lambda limit: solve(inputs, init, replace(options, max_distance=limit))
+        first = se3_from_matrix(centred_pose(init, *inputs[:2]), inputs.source.points.dtype) if coarse else None
+        run, doubt = start_check.unless_left(
+            run, first, lambda limit: solve(inputs, init, replace(options, max_distance=limit))
         )
     if equalizes and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
@@ -214,28 +172,36 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
             for change in changes:
                 warn(change)
     if measures:
-        # Again from its pose, with tie points and prior weighed by its covariance.
-        if run.executor is None:
-            moments = moments_traced(run.loop, jax.lax.stop_gradient(run.problem), search)
-        else:
-            with outside_trace():
-                moments = moments_of(run.executor, run.loop)
-        fusion = fusion_of(run.loop.state, moments, run.inputs.tie_points, run.inputs.prior, traced)
-        settings = run.problem.settings
-        if options.max_distance is None:
-            settings = settings._replace(max_distance=settings.fine_distance)
-        problem = replace(run.problem, start=constant(run.loop.state.pose), settings=settings, measurements=fusion)
-        run = run_loop(run.inputs, problem, search, options.max_iterations, traced)
-        if doubt and distance_moved(problem.start, run.loop.state) > settings.fine_distance:
+        run = _fused(run, options, traced)
+        limit = run.problem.settings.fine_distance
+        if doubt and start_check.distance_moved(run.problem.start, run.loop.state) > limit:
             # It was about another pose; where views have little in common, it is about this one, too.
-            overlap = surface_fit(run.inputs, cast(HostExecutor, run.executor), run.loop).overlap
-            doubt = doubt if overlap < LITTLE_IN_COMMON else ""
+            overlap = start_check.surface_fit(run.inputs, run.executor, run.loop).overlap
+            doubt = doubt if overlap < start_check.LITTLE_IN_COMMON else ""
+    return run if traced else _with_doubt(run, doubt, measures)
+
+
+def _fused(run: Run, options: Options, traced: bool) -> Run:
+    """A registration again from its pose, with tie points and prior weighed by its covariance."""
+    state, settings = run.loop.state, run.problem.settings
     if traced:
-        return run
-    status = run.loop.state.status
-    if status == Status.UNVERIFIED:
-        measurements = run.problem.measurements
-        from_prior, from_ties = squared_residuals(run.loop.state.pose, measurements)
+        moments = moments_traced(run.loop, jax.lax.stop_gradient(run.problem), run.search)
+    else:
+        with outside_trace():
+            moments = moments_of(run.executor, run.loop)
+    fusion = tie_points_and_prior.fusion_of(state, moments, run.inputs.tie_points, run.inputs.prior, traced)
+    if options.max_distance is None:
+        settings = settings._replace(max_distance=settings.fine_distance)
+    problem = replace(run.problem, start=constant(state.pose), settings=settings, measurements=fusion)
+    return run_loop(run.inputs, problem, run.search, options.max_iterations, traced)
+
+
+def _with_doubt(run: Run, doubt: str, measures: bool) -> Run:
+    """A run on the host with the reason why its pose is UNVERIFIED, as is a converged one with a `doubt`; warns if near
+    points make it DEGENERATE."""
+    state, measurements = run.loop.state, run.problem.measurements
+    if state.status == Status.UNVERIFIED:
+        from_prior, from_ties = squared_residuals(state.pose, measurements)
         if from_prior > CONTRADICTION:
             doubt = f"prior: the pose is {np.sqrt(from_prior):.2g} standard deviations away from it, and UNVERIFIED"
         elif measurements is not None and from_ties > measurements.form.most:
@@ -245,34 +211,36 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
                 "or more uncertain"
             )
         else:
-            doubt = doubt_of_patterns(run.inputs.source)
-        run = run._replace(doubt=doubt)
-    elif not measures and status == Status.DEGENERATE and run.loop.state.directions is not None:
-        _warn_of_near_points(run)
-    elif status == Status.CONVERGED and doubt:
-        state = run.loop.state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
-        doubt = f"the pose is UNVERIFIED: {doubt}"
-        run = run._replace(loop=run.loop._replace(state=state), doubt=doubt)
+            doubt = sensor_patterns.doubt_of_patterns(run.inputs.source)
+        return run._replace(doubt=doubt)
+    if state.status == Status.CONVERGED and doubt:
+        state = state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
+        return run._replace(loop=run.loop._replace(state=state), doubt=f"the pose is UNVERIFIED: {doubt}")
+    if measures or state.status != Status.DEGENERATE or state.directions is None:
+        return run
+    points, near = np.asarray(run.inputs.source.points)[run.inputs.source.valid], run.problem.settings.near
+    with np.errstate(over="ignore"):
+        are_near = np.square(points).sum(axis=1) < near**2
+    constrained = state.directions.constrained.sum()
+    if are_near.any() and run.executor.directions_by_all_points(run.loop).constrained.sum() > constrained:
+        warn(
+            f"source: little but points within {float(near):.2g} m of the origin constrains the pose in some "
+            "direction. They may be the sensor's own vehicle, which moves with it, so the status is DEGENERATE; leave "
+            "them out by PointCloud.crop, pass a prior, or move the clouds if the sensor is not at their origin"
+        )
     return run
 
 
 @with_settings_of_package
 def results_of(runs: Sequence[Run], givens: Sequence[Inputs]) -> list[RegistrationResult]:
     """The results of runs on the host; poses get derivatives by traced arrays of `givens`, computed side by side."""
-    derivatives = [
-        differentiated(given, run.inputs, cast(HostExecutor, run.executor), run.loop)
-        for run, given in zip(runs, givens, strict=True)
-    ]
-    states = with_derivatives([run.loop.state for run in runs], derivatives)
     results = []
-    for state, run, given in zip(states, runs, givens, strict=True):
+    for state, run, given in zip(with_derivatives(runs, givens), runs, givens, strict=True):
         # Cells, whose origin may differ, are made of concrete clouds alone: a traced origin is that of the argument.
         traces_origins = not is_concrete(given.source.origin, given.target.origin)
-        source, target = (given if traces_origins else run.inputs)[:2]
-        matchable, executor = run.problem.source.search.valid, cast(HostExecutor, run.executor)
-        jacobian_by = partial(jacobian, run.inputs, executor, run.loop)
-        ended = state, assessment_of(executor, run.loop), run.loop.history, source, target, matchable, jacobian_by
-        results.append(registration_of(*ended, given))
+        clouds, matchable = (given if traces_origins else run.inputs)[:2], run.problem.source.search.valid
+        ended = state, assessment_of(run.executor, run.loop), run.loop.history, *clouds, matchable
+        results.append(registration_of(*ended, partial(jacobian, run), given))
     return results
 
 
@@ -292,7 +260,7 @@ def run_loop(inputs: Inputs, problem: Problem, search: AbstractSearch | None, ma
     with outside_trace():
         loop = executor.run()
         if loop.state.status == Status.NON_FINITE:
-            warn_of_extensions(inputs.method, executor, loop)
+            input_checks.warn_of_extensions(inputs.method, executor, loop)
     return Run(inputs, problem, loop, search, executor)
 
 
@@ -302,7 +270,7 @@ def problem_of(
 ) -> tuple[Problem, Inputs]:
     """The problem, in NumPy where everything is concrete; and its inputs, with the method's parameters chosen."""
     source, target, method = given[:3]
-    check_clouds(source, target, method)
+    input_checks.check_clouds(source, target, method)
     rows = rows_to_match(source, options)
     pair = surface_pair(
         method,
@@ -323,7 +291,7 @@ def problem_of(
         compared = method.uses_channels and target.channels.shape[-1] > 0
         soft = compared and matches is None and not any(term.by_position for term in pair.terms)
     observes_channels = method.uses_channels and matches is None and source.channels.shape[-1]
-    may_move = channels_may_move(source) if observes_channels else False
+    may_move = sensor_patterns.channels_may_move(source) if observes_channels else False
     problem = Problem(
         se3_from_matrix(centred_pose(init, source, target), source.points.dtype),
         pair.source,
@@ -338,51 +306,13 @@ def problem_of(
     return problem, given._replace(method=pair.method, source_rows=rows)
 
 
-def _warn_of_near_points(run: Run) -> None:
-    points, near = np.asarray(run.inputs.source.points)[run.inputs.source.valid], run.problem.settings.near
-    with np.errstate(over="ignore"):
-        squares = np.square(points).sum(axis=1)
-    if not (squares < near**2).any():
-        return
-    before = cast(Directions, run.loop.state.directions)
-    after = cast(HostExecutor, run.executor).directions_by_all_points(run.loop)
-    if after.constrained.sum() > before.constrained.sum():
-        warn(
-            f"source: little but points within {float(near):.2g} m of the origin constrains the pose in some "
-            "direction. They may be the sensor's own vehicle, which moves with it, so the status is DEGENERATE; leave "
-            "them out by PointCloud.crop, pass a prior, or move the clouds if the sensor is not at their origin"
-        )
-
-
 def rows_to_match(source: PointCloud, options: Options) -> Int[AnyArray, "n"] | None:
     limit = options.max_source_points
     return None if limit is None or limit >= source.valid.size else spread_rows(source.valid, limit)
 
 
-def _unless_left(run: Run, init: Pose | None, at_scales: bool, closely: Callable[[float], Run]) -> tuple[Run, str]:
-    """The registration, or `closely(max_distance)` from the same start if it may have left a right initial pose and
-    surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing."""
-    settings, state, executor = run.problem.settings, run.loop.state, cast(HostExecutor, run.executor)
-    source, target = run.inputs[:2]
-    start = run.problem.start
-    if at_scales:
-        start = se3_from_matrix(centred_pose(init, source, target), source.points.dtype)
-    doubt = doubt_of_start(start, state, settings, partial(surface_fit, run.inputs, executor, run.loop), at_scales)
-    if doubt is None:
-        return run, ""
-    fine = float(settings.fine_distance)
-    candidates = [Candidate(run, state, doubt.fit, doubt.moved, (float(settings.max_distance), fine))]
-    for distance in doubt.distances(fine):
-        other = closely(distance)
-        if other.loop.state.status in USABLE:
-            # All are measured within the same distance.
-            fit, moved = surface_fit(run.inputs, executor, other.loop), distance_moved(start, other.loop.state)
-            candidates.append(Candidate(other, other.loop.state, fit, moved, (distance,)))
-    return choice_of(candidates, doubt, fine)
-
-
 def _equalized(inputs: Inputs, matches: Correspondences | None = None) -> Inputs:
-    check_channels(*inputs[:3])
+    input_checks.check_channels(*inputs[:3])
     source, gains = with_channels_matched(*inputs[:2], matches)
     return inputs._replace(source=source, gains=gains if inputs.gains is None else inputs.gains * gains)
 

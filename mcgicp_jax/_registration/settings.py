@@ -63,25 +63,14 @@ class Settings(NamedTuple):
     rounding: Float[AnyArray, "*batch 2 3"]
     near: Float[AnyArray, "*batch"]
 
-    def distance(self, status: Int[AnyScalar, ""]) -> Float[AnyScalar, ""]:
-        return _either(status == COARSE, self.max_distance, self.fine_distance)
-
-    def kernel_width(self, status: Int[AnyScalar, ""]) -> AnyScalar:
-        """Factor of the scale of robust kernels at this status: residuals grow with the distance of the matches, and a
-        kernel that redescends would ignore all that could move the pose."""
-        return _either(status == COARSE, self.max_distance / self.fine_distance, 1.0)
-
     def stride(self, status: Int[AnyScalar, ""], num_iterations: Int[AnyScalar, ""]) -> Int[AnyScalar, ""]:
         """Stride of the source points at this status. Once `max_iterations` are done, all points are measured."""
-        coarse = (status == COARSE) & (num_iterations < self.max_iterations)
-        return _either(coarse, self.coarse_stride, np.int32(1))
+        return either((status == COARSE) & (num_iterations < self.max_iterations), self.coarse_stride, np.int32(1))
 
 
-def _either(condition: Bool[AnyScalar, ""], one: AnyScalar, other: Any) -> Any:
-    """One number or the other; on the host without a call of NumPy, which would take longer than the rest."""
-    if isinstance(condition, np.bool_):
-        return one if condition else other
-    return jnp.where(condition, one, other)
+def either(condition: Bool[AnyScalar, ""], one: AnyScalar, other: Any) -> Any:
+    """`where` for numbers; on the host without a call of NumPy, which would take longer than the rest."""
+    return (one if condition else other) if isinstance(condition, np.bool_) else jnp.where(condition, one, other)
 
 
 def spacing_of(method: AbstractMethod, target: PointCloud) -> Any:
@@ -106,20 +95,16 @@ def settings_for(
     least = spacing * _TOLERANCE_IN_SPACINGS
     tolerance: Any = least if options.translation_tolerance is None else options.translation_tolerance
     steps = [harmful_steps(constant(cloud), spacing) for cloud in (source, target)]
-    fixed = constant(source)
+    fixed, dtype = constant(source), source.points.dtype
     rows, counts = sampled_rows(fixed.valid)
-    xp: Any = numpy_for(fixed, counts)
-    # Squares of huge coordinates overflow.
-    with np.errstate(over="ignore"):
-        ranges = xp.where(counts, xp.linalg.norm(xp.asarray(fixed.points)[rows], axis=1), np.nan)
-    near = _NEAR * median(ranges)
     coarse, fine = max_distance if isinstance(max_distance, tuple) or np.shape(max_distance) else [max_distance] * 2
     limits, turn = (options.min_coarse_distance, options.max_coarse_distance), options.rotation_tolerance
-    dtype = source.points.dtype
-    others = options.hold_unconstrained, may_move, stride
-    xp = numpy_for(coarse, fine, limits, tolerance, least, turn, others, steps, near)
-    # Steps of huge coordinates overflow.
+    # Squares of huge coordinates and of their steps overflow.
     with np.errstate(over="ignore"):
+        xp: Any = numpy_for(fixed, counts)
+        near = _NEAR * median(xp.where(counts, xp.linalg.norm(xp.asarray(fixed.points)[rows], axis=1), np.nan))
+        others = options.hold_unconstrained, may_move, stride
+        xp = numpy_for(coarse, fine, limits, tolerance, least, turn, others, steps, near)
         # An error that is uniform over a step. It does not average out: points on lattices match the lattice.
         rounding = xp.stack(steps) ** 2 / 12
     return Settings(

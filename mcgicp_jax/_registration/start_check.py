@@ -9,8 +9,7 @@ common, the surfaces may coincide there, too, and neither pose can be promised.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Generic, NamedTuple, TypeVar, cast
+from typing import NamedTuple, cast
 
 import jaxlie
 import numpy as np
@@ -23,7 +22,7 @@ from mcgicp_jax._math.statistics import sampled_rows
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.matched import Motion
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, State
-from mcgicp_jax._registration.pose_derivative import Inputs
+from mcgicp_jax._registration.pose_derivative import Inputs, Run
 from mcgicp_jax._registration.result import USABLE, Status
 from mcgicp_jax._registration.settings import Settings
 
@@ -64,8 +63,6 @@ LITTLE_IN_COMMON = 0.6
 # Number of matches that are compared. Four times as many do not separate poses any better.
 _SAMPLE = 1024
 
-AnyRun = TypeVar("AnyRun")
-
 
 class SurfaceFit(NamedTuple):
     """How well the surfaces of two clouds coincide at a pose.
@@ -85,12 +82,6 @@ class SurfaceFit(NamedTuple):
         least = _SOME_FIT if self.overlap <= other.overlap else _GOOD_FIT
         return bool(self.fit > least and self.fit * self.overlap > factor * other.fit * other.overlap)
 
-    def coincides_like(self, other: SurfaceFit) -> bool:
-        """Whether surfaces coincide, or do about as well as at another pose. With more matches than there they have to,
-        since scan lines match themselves at the initial pose."""
-        least = _GOOD_FIT if self.overlap > other.overlap else max(_SOME_FIT, min(_GOOD_FIT, other.fit / _BETTER))
-        return bool(self.fit > least)
-
 
 class Doubt(NamedTuple):
     """Why a registration may have left a right initial pose.
@@ -100,6 +91,7 @@ class Doubt(NamedTuple):
         little: whether the views have little in common.
         by_shape: whether there are few matches, and no channel constrains the pose.
         changing: whether the one reason is that its pose is still changing.
+        distances: the `max_distance` of the registrations that are to be compared with it, metres.
     """
 
     fit: SurfaceFit
@@ -108,14 +100,10 @@ class Doubt(NamedTuple):
     few: bool
     by_shape: bool
     changing: bool
-
-    def distances(self, fine: float) -> list[float]:
-        """The `max_distance` of the registrations that are compared, metres."""
-        return [fine, _CLOSE * fine] if self.few and not self.little else [fine]
+    distances: list[float]
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate(Generic[AnyRun]):
+class _Candidate(NamedTuple):
     """A registration from the initial pose.
 
     Attributes:
@@ -123,7 +111,7 @@ class Candidate(Generic[AnyRun]):
         max_distance: that it used, metres: the coarse and the fine one, or one for both.
     """
 
-    run: AnyRun
+    run: Run
     state: State
     fit: SurfaceFit
     moved: float
@@ -136,12 +124,28 @@ class Candidate(Generic[AnyRun]):
         return f"({numbers})" if len(self.max_distance) > 1 else numbers
 
 
+def unless_left(run: Run, start: jaxlie.SE3 | None, closely: Callable[[float], Run]) -> tuple[Run, str]:
+    """The registration, or `closely(max_distance)` from the same start if it may have left a right initial pose and
+    surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing. `start`: the
+    initial pose of several scales, of which `run` is the last; None if `run` started there."""
+    problem, state, at_scales = run.problem, run.loop.state, start is not None
+    start, settings = problem.start if start is None else start, problem.settings
+    doubt = doubt_of_start(start, state, settings, lambda: surface_fit(run.inputs, run.executor, run.loop), at_scales)
+    if doubt is None:
+        return run, ""
+    fine = float(settings.fine_distance)
+    candidates = [_Candidate(run, state, doubt.fit, doubt.moved, (float(settings.max_distance), fine))]
+    for distance in doubt.distances:
+        other = closely(distance)
+        if other.loop.state.status in USABLE:
+            # All are measured within the same distance.
+            fit, moved = surface_fit(run.inputs, run.executor, other.loop), distance_moved(start, other.loop.state)
+            candidates.append(_Candidate(other, other.loop.state, fit, moved, (distance,)))
+    return _choice_of(candidates, doubt, fine)
+
+
 def doubt_of_start(
-    start: jaxlie.SE3,
-    state: State,
-    settings: Settings,
-    measure_fit: Callable[[], SurfaceFit],
-    at_scales: bool = False,
+    start: jaxlie.SE3, state: State, settings: Settings, measure_fit: Callable[[], SurfaceFit], at_scales: bool = False
 ) -> Doubt | None:
     """The doubt of a registration, if there is any; `measure_fit` computes the `surface_fit` at its pose.
 
@@ -152,7 +156,7 @@ def doubt_of_start(
     """
     if not (at_scales or settings.max_distance > settings.fine_distance) or state.status not in USABLE:
         return None
-    moved = distance_moved(start, state)
+    moved, fine = distance_moved(start, state), float(settings.fine_distance)
     if moved <= settings.fine_distance:
         return None
     fit = measure_fit()
@@ -163,7 +167,8 @@ def doubt_of_start(
     slid = far or state.status == Status.DEGENERATE
     left = fit.fit < (_GOOD_FIT if few else _LEAST_FIT) or little or (by_shape and slid and not at_scales)
     changing = not (left or at_scales) and state.status == Status.MAX_ITERATIONS
-    return Doubt(fit, moved, little, few, by_shape, changing) if left or changing else None
+    distances = [fine, _CLOSE * fine] if few and not little else [fine]
+    return Doubt(fit, moved, little, few, by_shape, changing, distances) if left or changing else None
 
 
 def surface_fit(inputs: Inputs, executor: AbstractExecutor, loop: LoopResult) -> SurfaceFit:
@@ -202,16 +207,19 @@ def distance_moved(start: jaxlie.SE3, state: State) -> float:
     return float(np.linalg.norm(shift) + directions.radius * angle)
 
 
-def choice_of(candidates: list[Candidate[AnyRun]], doubt: Doubt, fine: float) -> tuple[AnyRun, str]:
+def _choice_of(candidates: list[_Candidate], doubt: Doubt, fine: float) -> tuple[Run, str]:
     """The best registration, and why its pose is ambiguous, or nothing. The first candidate is the one in doubt, with
     the fine `max_distance` `fine`, metres."""
     best, *others = candidates
     for other in others:
         best = other if other.fit.exceeds(best.fit, _BETTER) else best
 
-    def is_nearer(other: Candidate[AnyRun]) -> bool:
-        """Whether surfaces coincide at a pose nearer to the initial one than the best, and shape alone decides."""
-        return doubt.by_shape and other.moved < best.moved - fine and other.fit.coincides_like(best.fit)
+    def is_nearer(other: _Candidate) -> bool:
+        """Whether shape alone decides, and surfaces coincide, or do about as well as at the best pose, at one nearer to
+        the initial pose. With more matches they have to coincide: scan lines match themselves at the initial pose."""
+        has_more_matches = other.fit.overlap > best.fit.overlap
+        least = _GOOD_FIT if has_more_matches else max(_SOME_FIT, min(_GOOD_FIT, best.fit.fit / _BETTER))
+        return doubt.by_shape and other.moved < best.moved - fine and bool(other.fit.fit > least)
 
     changing = candidates[0] if doubt.changing else None
     if best.state.status == Status.DEGENERATE:
@@ -229,14 +237,14 @@ def choice_of(candidates: list[Candidate[AnyRun]], doubt: Doubt, fine: float) ->
         if doubt.little or other is changing or other.fit.exceeds(best.fit, margin) or is_nearer(other)
     ]
     # Why the pose of the best one is ambiguous, and what to pass.
-    distances = [distance_moved(best.state.pose, rival.state) for rival in rivals]
-    apart = max(distances, default=0.0)
     common = f"fewer than {LITTLE_IN_COMMON:.0%} of the source points lie on the target, and " if doubt.little else ""
     if doubt.little and len(rivals) == 1:
         return best.run, f"{common}registration with a smaller max_distance fails; pass a better initial pose"
-    if apart <= fine:
+    distances = [distance_moved(best.state.pose, rival.state) for rival in rivals]
+    distance = max(distances, default=0.0)
+    if distance <= fine:
         return best.run, ""
-    rival = rivals[distances.index(apart)]
+    rival = rivals[distances.index(distance)]
     nearest = min(best, rival, key=lambda candidate: candidate.moved)
     unsettled = rival.state.status == Status.MAX_ITERATIONS
     another = "another that is still changing" if unsettled else "another"
@@ -245,6 +253,6 @@ def choice_of(candidates: list[Candidate[AnyRun]], doubt: Doubt, fine: float) ->
     advice = f"max_distance={nearest.limit} if the initial pose is good to {fine:.2g} m, or else "
     return best.run, (
         f"{common}max_distance={best.limit} leads to this pose, {best.moved:.2g} m from the initial one, but "
-        f"max_distance={rival.limit} to {another}, {apart:.2g} m from this one{coincide}. Pass "
+        f"max_distance={rival.limit} to {another}, {distance:.2g} m from this one{coincide}. Pass "
         f"{advice if len(nearest.max_distance) == 1 else ''}a better init"
     )

@@ -18,17 +18,11 @@ from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, constant, is_concr
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._math.poses import matrix_of, translation_adjoint
 from mcgicp_jax._math.symmetric_matrices import inverse_6
+from mcgicp_jax._pose_solver import pose_measurements
 from mcgicp_jax._pose_solver.covariance import Moments
 from mcgicp_jax._pose_solver.degeneracy import Directions
 from mcgicp_jax._pose_solver.fusion import fuse
-from mcgicp_jax._pose_solver.pose_measurements import (
-    Fusion,
-    PoseMeasurements,
-    Prior,
-    TiePoints,
-    form_at,
-    with_fixed_directions,
-)
+from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseMeasurements, Prior, TiePoints
 from mcgicp_jax._registration.assessment import as_float64
 from mcgicp_jax._registration.loop import Problem, State
 
@@ -55,7 +49,7 @@ def checked_measurements(
     ties = None
     if tie_points is not None:
         form = "(source_points, target_points, covariances)"
-        points, targets, covariances = _parts("tie_points", tie_points, form, 3)
+        points, targets, covariances = _parts("tie_points", tie_points, form)
         count = np.shape(points)[0] if np.ndim(points) else 0
         points = _numbers("tie_points: source_points", points, (count, 3))
         targets = _numbers("tie_points: target_points", targets, (count, 3))
@@ -67,7 +61,7 @@ def checked_measurements(
         ties = TiePoints(points - source.origin, targets - target.origin, covariances)
     if prior is None:
         return ties, None
-    pose, covariance = _parts("prior", prior, "(pose, covariance)", 2)
+    pose, covariance = _parts("prior", prior, "(pose, covariance)")
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     # The points only scale the least deviations: while they are differentiated, their values suffice.
@@ -78,21 +72,18 @@ def checked_measurements(
     if is_concrete(value):
         values, rows = _principal_rows(np.asarray(value, np.float64))
         fixed = _orthonormal(rows[values <= _LEAST_EIGENVALUE])
-    variances = (_lengths(cloud) * _least_deviation(cloud)) ** 2
-    information = _information_traced(covariance, fixed, source.origin, variances)
+    lengths, least = _units(cloud)
+    information = _information_traced(covariance, fixed, source.origin, (lengths * least) ** 2)
     return ties, Prior(matrix[:3, :3], matrix[:3, 3], *information)
 
 
-def _lengths(source: PointCloud) -> Float[AnyArray, "6"]:
-    """Units of ξ in which its components move the points of the cloud by similar distances."""
+def _units(source: PointCloud) -> tuple[Float[AnyArray, "6"], float]:
+    """Units of ξ in which its components move the points of the cloud by similar distances; and in these σ₀, see
+    `_LARGEST_ERROR`: rounding of more precise directions would spoil the others."""
     xp = numpy_for(source.points)
     radius = xp.maximum(xp.max(xp.abs(source.points), initial=0), 1e-30)
-    return xp.repeat(xp.stack([radius, xp.ones_like(radius)]), 3)
-
-
-def _least_deviation(source: PointCloud) -> float:
-    """σ₀ of `_LARGEST_ERROR`, in units of `_lengths`. Rounding of more precise directions would spoil the others."""
-    return float(np.sqrt(np.finfo(source.points.dtype).eps / _LARGEST_ERROR))
+    least = float(np.sqrt(np.finfo(source.points.dtype).eps / _LARGEST_ERROR))
+    return xp.repeat(xp.stack([radius, xp.ones_like(radius)]), 3), least
 
 
 @jax.jit
@@ -150,22 +141,21 @@ def _information(
         change = translation_adjoint(-np.asarray(offset, np.float64))
         references.append((offset, *_principal_rows(change @ covariance @ change.T)))
     # Rounding lets directions look fixed that are not.
-    offset, values, rows = max(references, key=lambda each: sorted(np.where(each[1] > _LEAST_EIGENVALUE, each[1], 0)))
+    offset, values, rows = max(references, key=lambda item: sorted(np.where(item[1] > _LEAST_EIGENVALUE, item[1], 0)))
     definite = bool(values[0] >= -_LEAST_EIGENVALUE and np.all(np.diagonal(covariance) >= 0))
     _require("prior: covariance", _correlations(covariance)[1], definite, "positive semidefinite")
     fixed = values <= _LEAST_EIGENVALUE
     rows = rows @ translation_adjoint(source.origin - offset)
     root = np.where(fixed, 0, 1 / np.sqrt(np.maximum(values, _LEAST_EIGENVALUE)))[:, None] * rows
-    lengths = np.asarray(_lengths(source), np.float64)
+    lengths, least = _units(source)
+    lengths = np.asarray(lengths, np.float64)
     _, values, vectors = np.linalg.svd(root * lengths)
-    ratios = (values * _least_deviation(source)) ** 2
+    ratios = (values * least) ** 2
     root = (values / np.sqrt(1 + ratios * (ratios / (1 + ratios)) ** _SHARPNESS))[:, None] * vectors / lengths
     return root.T @ root, _orthonormal(rows[fixed], lengths)
 
 
-def measured(
-    problem: Problem, ties: TiePoints | None, prior: Prior | None, traced: bool, *, limits: bool = False
-) -> Problem:
+def measured(problem: Problem, ties: TiePoints | None, prior: Prior | None, traced: bool, limits: bool) -> Problem:
     """The problem of a first registration with tie points and a prior. If the prior `limits` it, the coarse
     `max_distance` is at most what the prior leaves between the initial pose and the right one."""
     dtype, (start, ties, prior) = problem.start.wxyz_xyz.dtype, constant((problem.start, ties, prior))
@@ -178,14 +168,14 @@ def measured(
     fixed = None if prior is None or prior.fixed is None else as_dtype(prior)
     if fixed is not None:
         with nullcontext() if traced else outside_trace():
-            start = jax.tree.map(xp.asarray, with_fixed_directions(start, fixed))
+            start = jax.tree.map(xp.asarray, pose_measurements.with_fixed_directions(start, fixed))
     matrix, valid = matrix_of(start), rows.valid[:, None]
     count = xp.maximum(xp.sum(valid), 1)
     mean = xp.sum(xp.where(valid, rows.points, 0), axis=0) / count
     square = xp.sum(xp.where(valid, rows.points - mean, 0) ** 2) / count
     rotation, translation, radius = matrix[:3, :3], matrix[:3, 3], xp.sqrt(xp.where(square > 0, square, 1))
     place = rotation, translation, rotation @ mean + translation, radius
-    form, settings = form_at(*place, ties, prior), problem.settings
+    form, settings = pose_measurements.form_at(*place, ties, prior), problem.settings
     if limits and prior is not None:
         most = xp.asarray(radius * _distance_to_prior(rotation, form.prior), dtype)
         nearer = xp.maximum(xp.minimum(settings.max_distance, most), settings.fine_distance)
@@ -202,9 +192,9 @@ def _distance_to_prior(rotation: Float[AnyArray, "3 3"], prior: Prior) -> Float[
     # Fixed directions count as if they were the most certain ones.
     variance = xp.trace(inverse_6(prior.information + fixed * (1 + xp.trace(prior.information))))
     turn = xp.linalg.norm(prior.rotation - rotation) / np.sqrt(2)
-    known = xp.isfinite(variance) & (variance > 0)
-    deviation = xp.sqrt(xp.where(known, variance, 1))
-    return xp.where(known, xp.linalg.norm(prior.translation) + turn + _DEVIATIONS * deviation, xp.inf)
+    is_known = xp.isfinite(variance) & (variance > 0)
+    deviation = xp.sqrt(xp.where(is_known, variance, 1))
+    return xp.where(is_known, xp.linalg.norm(prior.translation) + turn + _DEVIATIONS * deviation, xp.inf)
 
 
 def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Prior | None, traced: bool) -> Fusion:
@@ -215,7 +205,7 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
     if not traced:
         # Reading NumPy arrays compiles nothing.
         center, directions = jax.tree.map(np.asarray, (center, directions))
-    form = form_at(matrix[:3, :3], matrix[:3, 3], center, directions.radius, ties, prior)
+    form = pose_measurements.form_at(matrix[:3, :3], matrix[:3, 3], center, directions.radius, ties, prior)
     if traced:
         # The form alone has a derivative.
         fusion = fuse(state.pose, center, directions, moments, constant(form))
@@ -227,11 +217,11 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
     return jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
 
 
-def _parts(name: str, value: Any, form: str, count: int) -> Any:
-    if not isinstance(value, tuple | list) or len(value) != count:
-        got = f"{len(value)} items" if isinstance(value, tuple | list) else type(value).__name__
-        raise ValueError(f"{name}: expected {form}, got {got}")
-    return value
+def _parts(name: str, value: Any, form: str) -> Any:
+    if isinstance(value, tuple | list) and len(value) == form.count(",") + 1:
+        return value
+    got = f"{len(value)} items" if isinstance(value, tuple | list) else type(value).__name__
+    raise ValueError(f"{name}: expected {form}, got {got}")
 
 
 def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Any:

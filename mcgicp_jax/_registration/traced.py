@@ -22,9 +22,9 @@ from mcgicp_jax._pose_solver.matched import Matches, Motion, inputs_of, match_su
 from mcgicp_jax._pose_solver.sums import Sums, sums_of
 from mcgicp_jax._registration.assessment import Assessment, assessment_of, moments_of
 from mcgicp_jax._registration.loop import AbstractExecutor, LoopResult, Problem, State, root_of
-from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED
+from mcgicp_jax._registration.settings import COARSE, RUNNING, SETTLED, either
 from mcgicp_jax._search.base import AbstractSearch, SearchPoints, by_position
-from mcgicp_jax._terms.base import AbstractTerm, is_adaptive, with_numbers_of
+from mcgicp_jax._terms.base import AbstractTerm, with_numbers_of
 
 
 class TracedExecutor(AbstractExecutor):
@@ -34,26 +34,23 @@ class TracedExecutor(AbstractExecutor):
         super().__init__(problem)
         self._search, self._max_iterations = search, max_iterations
 
-    def begin(self) -> LoopResult:
+    def run(self, max_updates: Any = None) -> LoopResult:
+        """The loop at its end, or after `max_updates`, with a negative status."""
         problem, first = self.problem, self.problem.first_state
         nowhere = jnp.full((problem.num_candidates, problem.source.num_points), -1, jnp.int32)
         matches = problem.matches or Matches(nowhere, jnp.zeros_like(problem.settings.fine_distance))
-        terms = jax.tree.map(jnp.asarray, problem.terms)
-        loop = LoopResult(first, matches, terms, None)
+        loop = LoopResult(first, matches, jax.tree.map(jnp.asarray, problem.terms), None)
+        # The loop carries a whole state from the beginning.
         after = jax.eval_shape(lambda: super(TracedExecutor, self).step(loop).state)
         state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), after)
         # One entry per update, and one at the returned pose.
         history = jax.tree.map(lambda leaf: jnp.full(self._max_iterations + 1, jnp.nan, leaf.dtype), state.record)
-        return loop._replace(state=state._replace(pose=first.pose, status=first.status), history=history)
+        loop = loop._replace(state=state._replace(pose=first.pose, status=first.status), history=history)
 
-    def run(self, max_updates: Any = None) -> LoopResult:
-        """The loop at its end, or after `max_updates`, with a negative status."""
+        def unfinished(loop: LoopResult) -> Bool[Array, ""]:
+            return (loop.state.status < 0) & (max_updates is None or loop.state.num_iterations < max_updates)
 
-        def runs(loop: LoopResult) -> Bool[Array, ""]:
-            state = loop.state
-            return (state.status < 0) & (max_updates is None or state.num_iterations < max_updates)
-
-        return jax.lax.while_loop(runs, self.step, self.begin())
+        return jax.lax.while_loop(unfinished, self.step, loop)
 
     def step(self, loop: LoopResult) -> LoopResult:
         loop = super().step(loop)
@@ -65,8 +62,6 @@ class TracedExecutor(AbstractExecutor):
 
     def match(self, state: State, before: Matches) -> Matches:
         problem, status, settings = self.problem, state.status, self.problem.settings
-        if problem.matches is not None:
-            return before
         # Under `vmap` the body also runs for registrations that have ended: no search for them.
         running = (status < 0) & (status != SETTLED)
         source, target = problem.source.search, problem.target.search
@@ -85,7 +80,8 @@ class TracedExecutor(AbstractExecutor):
             )
         limit, pose = settings.max_distance, state.pose.wxyz_xyz
         indices = self._search.nearest_traced(pose, source, target, limit, running, problem.num_candidates)
-        matches = Matches.of(source, target, indices, settings.distance(status))
+        limit = either(status == COARSE, settings.max_distance, settings.fine_distance)
+        matches = Matches.of(source, target, indices, limit)
         return matches._replace(indices=jnp.where(running, matches.indices, before.indices))
 
     def nearest(
@@ -96,8 +92,6 @@ class TracedExecutor(AbstractExecutor):
         return self._search.nearest_traced(pose, source, target, limit, jnp.bool_(True), num_candidates)
 
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
-        if not is_adaptive(before):
-            return before
         return jax.tree.map(partial(jnp.where, state.status == RUNNING), super().adapt(state, matches, before), before)
 
     def rows(
