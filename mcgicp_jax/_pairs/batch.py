@@ -121,8 +121,7 @@ def register_as_completed(
     """
     checked_options = options_of(register_batch, options)
     job = BatchJob(method, checked_options, voxel_size, num_neighbors, covariances, priors is not None)
-    workers = executor_of(executor)
-    pairs, count = _pairs(job, sources, targets, init, priors)
+    workers, (pairs, count) = executor_of(executor), _pairs(job, sources, targets, init, priors)
     return run(job, pairs, workers, count)
 
 

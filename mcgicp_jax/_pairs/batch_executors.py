@@ -34,7 +34,7 @@ from mcgicp_jax._registration.assessment import with_traced_pose
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Run
 from mcgicp_jax._registration.register_pair import results_of
-from mcgicp_jax._registration.result import RegistrationResult, Status
+from mcgicp_jax._registration.result import RegistrationResult, Status, verified
 
 GivenExecutor: TypeAlias = Executor | Literal["processes", "threads"] | None
 # An executor; threads; or, if None, what is faster.
@@ -135,11 +135,9 @@ def run_differentiated(
             continue
         ready, result = prepared[answer.index], answer.registration
         if answer.jacobian:
-            values, inputs = (
-                [np.asarray(result.centred.wxyz_xyz)],
-                [leaf for leaf in ready.leaves if not is_concrete(leaf)],
-            )
-            (pose,) = with_derivative(values, KnownJacobian(answer.jacobian), inputs)
+            inputs = [leaf for leaf in ready.leaves if not is_concrete(leaf)]
+            linear, value = KnownJacobian(answer.jacobian), np.asarray(result.centred.wxyz_xyz)
+            (pose,) = with_derivative([value], linear, inputs)
             origins = ready.inputs.source.origin, ready.inputs.target.origin
             if is_concrete(origins):
                 origins = result.source_origin, result.target_origin
@@ -148,7 +146,7 @@ def run_differentiated(
     differentiated = results_of(list(runs.values()), [prepared[index].inputs for index in runs])
     for (index, run), result in zip(runs.items(), differentiated, strict=True):
         ready = prepared[index]
-        result = job.with_wanted_fields(ready.checked(result))
+        result = job.with_wanted_fields(verified(result, not ready.doubt))
         results[index] = PairResult(index, result, ready.doubt or run.doubt).with_warning().registration
     return [results[index] for index in sorted(results)]
 

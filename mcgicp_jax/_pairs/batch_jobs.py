@@ -132,10 +132,6 @@ class PreparedPair:
         """Those of clouds, method and kernel."""
         return jax.tree.leaves(self.inputs[:4], is_leaf=is_deferred)
 
-    def checked(self, result: RegistrationResult) -> RegistrationResult:
-        """The result, UNVERIFIED if the initial pose is, or the overlap is small."""
-        return verified(result, not self.doubt)
-
 
 def _of_a_pair(work: Callable[..., Any]) -> Callable[..., Any]:
     """Decorator of methods for one pair: a `ValueError` becomes the reason of its result."""
@@ -234,11 +230,10 @@ class BatchJob:
         run = self._run(ready)
         if isinstance(run, PairResult):
             return run
-        (result,) = map(ready.checked, results_of([run], [run.inputs]))
         arrays = [ready.leaves[i] for i in pair.traced]
         slopes = parameters_by(ready.inputs, run, arrays)
         blocks = tuple(slope.astype(array.dtype) for slope, array in zip(slopes, arrays, strict=True))
-        return replace(self._result(pair.index, result, ready.doubt or run.doubt), jacobian=blocks)
+        return replace(self._result(ready, results_of([run], [run.inputs])[0], run.doubt), jacobian=blocks)
 
     @computed_on_cpu
     def run_chunk(self, chunk: list[Pair]) -> list[RanPair | PairResult]:
@@ -268,8 +263,7 @@ class BatchJob:
         run = self._run(pair)
         if isinstance(run, PairResult):
             return run
-        (result,) = results_of([run], [run.inputs])
-        return self._result(pair.index, pair.checked(result), pair.doubt or run.doubt)
+        return self._result(pair, results_of([run], [run.inputs])[0], run.doubt)
 
     def register_in_chunks(self, pairs: Iterable[Pair], num_threads: int) -> Iterator[PairResult]:
         """Register the pairs in chunks on this machine. One thread prepares those of small clouds, several the others;
@@ -310,9 +304,8 @@ class BatchJob:
                     source, target = pair.inputs[:2]
                     matchable = np.ones(min(len(source), most or len(source)), bool)
                     result = registration_of(ended.state, ended.assessment, ended.history, source, target, matchable)
-                    is_doubtful = result.status is Status.UNVERIFIED
-                    doubt = pair.doubt or (doubt_of_patterns(source) if is_doubtful else "")
-                    yield self._result(pair.index, pair.checked(result), doubt)
+                    doubt = doubt_of_patterns(source) if result.status is Status.UNVERIFIED else ""
+                    yield self._result(pair, result, doubt)
             yield from rejected
             yield from (future.result() for future in again)
 
@@ -340,9 +333,10 @@ class BatchJob:
             sides.append(cloud.replace_rows(**arrays).pad())
         return ready, ChunkPair(pose, source.points.dtype.type(ready.max_coarse_distance), *sides)
 
-    def _result(self, index: int, result: RegistrationResult, doubt: str) -> PairResult:
-        """The result without references to the clouds."""
-        return PairResult(index, computed(self.with_wanted_fields(result)), doubt)
+    def _result(self, pair: PreparedPair, result: RegistrationResult, doubt: str) -> PairResult:
+        """The result without references to the clouds; UNVERIFIED if the initial pose is, or the overlap is small."""
+        result = self.with_wanted_fields(verified(result, not pair.doubt))
+        return PairResult(pair.index, computed(result), pair.doubt or doubt)
 
     def with_wanted_fields(self, result: RegistrationResult) -> RegistrationResult:
         """The result, without covariance if so wanted."""

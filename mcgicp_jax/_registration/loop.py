@@ -18,7 +18,6 @@ transformations and in chunks of pairs on accelerators. The status is decided in
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -197,9 +196,7 @@ class AbstractExecutor(abc.ABC):
         """Target rows nearest in position, and unless `alone`, in channels; −1 for none within the fine distance."""
 
     @abc.abstractmethod
-    def rows(
-        self, function: Callable[..., Any], motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False
-    ) -> Any:
+    def rows(self, function: Any, motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False) -> Any:
         """Apply a function that returns one row per correspondence, to surfaces with `noise` and `search` if asked."""
 
     @abc.abstractmethod

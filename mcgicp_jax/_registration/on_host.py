@@ -75,9 +75,7 @@ class HostExecutor(AbstractExecutor):
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
         return super().adapt(state, matches, before) if state.status == RUNNING else before
 
-    def rows(
-        self, function: Callable[..., Any], motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False
-    ) -> Any:
+    def rows(self, function: Any, motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False) -> Any:
         applied = self._over(function, motion, matches, arguments, with_noise, total=False)
         return applied.rows(None, self._num_threads if with_noise else 1)[0].tree
 

@@ -49,7 +49,7 @@ def checked_measurements(
     ties = None
     if tie_points is not None:
         form = "(source_points, target_points, covariances)"
-        points, targets, covariances = _parts("tie_points", tie_points, form)
+        points, targets, covariances = _parts("tie_points", tie_points, form, 3)
         count = np.shape(points)[0] if np.ndim(points) else 0
         points = _numbers("tie_points: source_points", points, (count, 3))
         targets = _numbers("tie_points: target_points", targets, (count, 3))
@@ -61,7 +61,7 @@ def checked_measurements(
         ties = TiePoints(points - source.origin, targets - target.origin, covariances)
     if prior is None:
         return ties, None
-    pose, covariance = _parts("prior", prior, "(pose, covariance)")
+    pose, covariance = _parts("prior", prior, "(pose, covariance)", 2)
     matrix = centred_pose(pose, source, target, "prior: pose")
     covariance = _numbers("prior: covariance", covariance, (6, 6))
     # The points only scale the least deviations: while they are differentiated, their values suffice.
@@ -217,8 +217,8 @@ def fusion_of(state: State, moments: Moments, ties: TiePoints | None, prior: Pri
     return jax.tree.map(lambda array: array if array.dtype == bool else array.astype(dtype), fusion)
 
 
-def _parts(name: str, value: Any, form: str) -> Any:
-    if isinstance(value, tuple | list) and len(value) == form.count(",") + 1:
+def _parts(name: str, value: Any, form: str, count: int) -> Any:
+    if isinstance(value, tuple | list) and len(value) == count:
         return value
     got = f"{len(value)} items" if isinstance(value, tuple | list) else type(value).__name__
     raise ValueError(f"{name}: expected {form}, got {got}")

@@ -6,7 +6,6 @@ the loop; the implicit derivative is attached to the pose that the loop returns.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -94,9 +93,7 @@ class TracedExecutor(AbstractExecutor):
     def adapt(self, state: State, matches: Matches, before: tuple[AbstractTerm, ...]) -> tuple[AbstractTerm, ...]:
         return jax.tree.map(partial(jnp.where, state.status == RUNNING), super().adapt(state, matches, before), before)
 
-    def rows(
-        self, function: Callable[..., Any], motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False
-    ) -> Any:
+    def rows(self, function: Any, motion: Motion, matches: Matches, *arguments: Any, with_noise: bool = False) -> Any:
         inputs = inputs_of(self.problem.source, self.problem.target, matches, with_noise, with_search=with_noise)
         numbers = motion, matches.max_distance, matches.temperature, arguments
         return of_matches(function)(numbers, *map(whole, inputs))
