@@ -251,12 +251,7 @@ def _is_float(leaf: Any) -> bool:
 # The tangent of what has no derivative.
 _unknown = Primitive("mcgicp_unknown")
 
-
-@_unknown.def_impl
-def _nan(*_: Any, aval: Any, message: str) -> Any:
-    return jnp.full(aval.shape, jnp.nan, aval.dtype)
-
-
+_nan = _unknown.def_impl(lambda *_, aval, message: jnp.full(aval.shape, jnp.nan, aval.dtype))
 _unknown.def_abstract_eval(lambda *_, aval, message: aval)
 
 

@@ -22,8 +22,14 @@ from mcgicp_jax._compute.linear_maps import primal, without_derivative
 from mcgicp_jax._compute.programs import quickly_compiled
 from mcgicp_jax._math.poses import adjoint_to_center, se3_from_matrix, translation_adjoint, units
 from mcgicp_jax._math.statistics import sampled_rows
-from mcgicp_jax._pose_solver import covariance as covariance_estimate
-from mcgicp_jax._pose_solver.covariance import Frame, Moments
+from mcgicp_jax._pose_solver.covariance import (
+    Frame,
+    Moments,
+    discounts_and_radius,
+    moments_from,
+    noise_sample,
+    sandwich,
+)
 from mcgicp_jax._pose_solver.degeneracy import directions_at_source
 from mcgicp_jax._pose_solver.fusion import fused_covariance
 from mcgicp_jax._pose_solver.matched import Motion, sample_of_term
@@ -80,10 +86,10 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
         sampled = loop.matches.some(rows)
         first = executor.distances(motion, sampled).argmin(axis=0)[None]
         nearest = sampled._replace(indices=numpy_for(first).take_along_axis(sampled.indices, first, axis=0))
-        sample = executor.rows(covariance_estimate.noise_sample, motion, nearest, with_noise=True)
+        sample = executor.rows(noise_sample, motion, nearest, with_noise=True)
         sample = jax.tree.map(lambda column: xp.where(counts, column, np.asarray(np.nan, column.dtype)), sample)
         num_channels = xp.sum(xp.any(search.descriptors != 0, axis=0))
-        discount, neighborhood_radius = covariance_estimate.discounts_and_radius(sample, num_channels)
+        discount, neighborhood_radius = discounts_and_radius(sample, num_channels)
         frame = frame._replace(discount=discount, neighborhood_radius=neighborhood_radius)
     responding = None
     # Fixed matches do not respond to a motion.
@@ -92,7 +98,7 @@ def moments_of(executor: AbstractExecutor, loop: LoopResult) -> Moments:
     scores = executor.scores(motion, loop.matches, frame, loop.terms, responding)
     ours, theirs = problem.settings.rounding
     rounding = (motion.rotation * ours) @ motion.rotation.T + numpy_for(theirs).diag(theirs)
-    return covariance_estimate.moments_from(scores, search.valid.size)._replace(rounding=rounding)
+    return moments_from(scores, search.valid.size)._replace(rounding=rounding)
 
 
 def _with_response(term: AbstractTerm, executor: AbstractExecutor, loop: LoopResult) -> AbstractTerm:
@@ -135,7 +141,7 @@ def covariance_of_pose(state: State, weights: Moments | Fusion) -> Float[Array, 
     if isinstance(weights, Fusion):
         covariance = fused_covariance(state.pose, weights)
     else:
-        covariance = covariance_estimate.sandwich(state.pose, center, radius, weights, state.directions)
+        covariance = sandwich(state.pose, center, radius, weights, state.directions)
     return jnp.where(exists, covariance, jnp.nan)
 
 

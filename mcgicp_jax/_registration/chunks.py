@@ -10,6 +10,7 @@ import collections
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -235,15 +236,13 @@ class _Group:
             # One history entry per update, and one at the returned pose.
             count = int(state.num_iterations) + 1
             history = Record(*(entries[:count] for entries in history))
-            ended.append(Ended(key, state, assessment, history, _has_doubt(pair.start, state, check)))
+            # Settings and fit; None for a single `max_distance`.
+            fit = partial(itemgetter(1), check)
+            in_doubt = check is not None and doubt_of_start(pair.start, state, check[0], fit) is not None
+            ended.append(Ended(key, state, assessment, history, in_doubt))
         if first and len(pairs) - len(ended) > _MANY * len(pairs):
             self._first_updates = min(2 * self._first_updates, self._all_updates)
         return ended
-
-
-def _has_doubt(start: jaxlie.SE3, state: State, check: Any) -> bool:
-    """Whether there is a `doubt_of_start`, by settings and fit; None for a single `max_distance`."""
-    return check is not None and doubt_of_start(start, state, check[0], lambda: check[1]) is not None
 
 
 @with_settings_of_package

@@ -28,15 +28,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from mcgicp_jax._compute.concrete import AnyArray, AnyScalar, numpy_for
-from mcgicp_jax._math import poses
+from mcgicp_jax._math.poses import move_pose, units
 from mcgicp_jax._methods.surfaces import AnySurface
-from mcgicp_jax._pose_solver import pose_measurements
 from mcgicp_jax._pose_solver.covariance import Scores
 from mcgicp_jax._pose_solver.degeneracy import Directions, find_directions
 from mcgicp_jax._pose_solver.fusion import first_force, fused_update
 from mcgicp_jax._pose_solver.implicit_derivative import ImplicitRoot
 from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, sample_of_term
-from mcgicp_jax._pose_solver.pose_measurements import Fusion, PoseMeasurements, Prior
+from mcgicp_jax._pose_solver.pose_measurements import (
+    Fusion,
+    PoseMeasurements,
+    Prior,
+    constraints_at,
+    with_fixed_directions,
+)
 from mcgicp_jax._pose_solver.sums import Sums
 from mcgicp_jax._pose_solver.update import Update, rounding, solve_update
 from mcgicp_jax._registration.result import Status
@@ -267,9 +272,7 @@ def _change(
     directions, basis = None, jnp.eye(6, dtype=sums.center.dtype)
     degenerate: AnyScalar = np.bool_(False)
     if sums.observability is not None:
-        by_prior = None
-        if fixed is not None:
-            by_prior = pose_measurements.constraints_at(pose, sums.center, sums.radius, fixed)
+        by_prior = None if fixed is None else constraints_at(pose, sums.center, sums.radius, fixed)
         directions = find_directions(sums, by_prior)
         degenerate = ~jnp.all(directions.constrained)
         # Along unconstrained directions an update would follow arbitrary nearest-neighbour matches.
@@ -305,8 +308,8 @@ def update(
     deviation, estimated as if residuals were independent, which is smaller than that of the pose.
     """
     change, directions, degenerate = _change(pose, sums, settings, measurements, fixed)
-    moved = poses.move_pose(pose, change.twist, sums.center)
-    moved = moved if fixed is None else pose_measurements.with_fixed_directions(moved, fixed)
+    moved = move_pose(pose, change.twist, sums.center)
+    moved = moved if fixed is None else with_fixed_directions(moved, fixed)
     coarse, settled = status == COARSE, status == SETTLED
     since = since + change.twist
     sizes = jnp.linalg.norm(jnp.stack([change.twist, since]).reshape(2, 2, 3), axis=2)
@@ -315,7 +318,7 @@ def update(
     def below(translation: Float[AnyScalar, ""], rotation: Float[AnyScalar, ""]) -> Bool[Array, ""]:
         return (translation_step <= translation) & (rotation_step <= rotation)
 
-    motion_since = since / poses.units(sums.radius)
+    motion_since = since / units(sums.radius)
     extent = jnp.maximum(extent, motion_since @ change.information @ motion_since * sums.radius**2)
     returned = (translation_since <= settings.translation_tolerance) & (rotation_since <= settings.rotation_tolerance)
     cycles = (status == RUNNING) & returned & (extent * sums.count <= sums.cost)

@@ -19,9 +19,14 @@ from mcgicp_jax._compute.concrete import AnyArray, constant, is_concrete, numpy_
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.messages import messages_named, warn
 from mcgicp_jax._compute.threads import in_new_thread, with_settings_of_package
-from mcgicp_jax._local_geometry import sensor_patterns
 from mcgicp_jax._local_geometry.cloud_statistics import changes_of_exposure, with_channels_matched
 from mcgicp_jax._local_geometry.neighborhoods import check_neighbors
+from mcgicp_jax._local_geometry.sensor_patterns import (
+    channels_may_move,
+    doubt_of_patterns,
+    without_constant_part,
+    without_patterns,
+)
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.base import AbstractMethod
@@ -30,7 +35,7 @@ from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.ndt import voxel_gaussians
 from mcgicp_jax._methods.surfaces import surface_pair, whole_surface
 from mcgicp_jax._pose_solver.matched import Matches
-from mcgicp_jax._registration import input_checks, start_check, tie_points_and_prior
+from mcgicp_jax._registration import input_checks
 from mcgicp_jax._registration.assessment import assessment_of, moments_of, registration_of
 from mcgicp_jax._registration.correspondences import find_correspondences, index_of
 from mcgicp_jax._registration.loop import CONTRADICTION, Problem, squared_residuals
@@ -39,7 +44,14 @@ from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs, Run, jacobian, with_derivatives
 from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status
 from mcgicp_jax._registration.settings import settings_for, spacing_of
-from mcgicp_jax._registration.tie_points_and_prior import GivenPrior, GivenTiePoints
+from mcgicp_jax._registration.start_check import LITTLE_IN_COMMON, distance_moved, surface_fit, unless_left
+from mcgicp_jax._registration.tie_points_and_prior import (
+    GivenPrior,
+    GivenTiePoints,
+    checked_measurements,
+    fusion_of,
+    measured,
+)
 from mcgicp_jax._registration.traced import assess, differentiable, moments_traced, run_traced
 from mcgicp_jax._search.base import AbstractIndex, AbstractSearch, Correspondences
 from mcgicp_jax._search.default_search import default_search
@@ -116,7 +128,7 @@ def prepared(
         raise ValueError(f"voxel_sizes: expected none inside jit and vmap, {advice}")
     if options.voxel_sizes and method.needs_covariances and not is_concrete(source, target):
         raise ValueError("voxel_sizes: expected none for derivatives with cells; make these with voxel_gaussians")
-    measurements = tie_points_and_prior.checked_measurements(tie_points, prior, source, target)
+    measurements = checked_measurements(tie_points, prior, source, target)
     return Inputs(source, target, method, options.robust, *measurements)
 
 
@@ -124,9 +136,9 @@ def without_sensor_patterns(
     source: PointCloud, target: PointCloud, method: AbstractMethod
 ) -> tuple[PointCloud, PointCloud]:
     """The clouds for a method that uses channels, without what moves with the sensor."""
-    source, target = sensor_patterns.without_patterns(source, target)
+    source, target = without_patterns(source, target)
     if isinstance(method, MultiChannelGICP) and method.photometric:
-        return sensor_patterns.without_constant_part(source), sensor_patterns.without_constant_part(target)
+        return without_constant_part(source), without_constant_part(target)
     return source, target
 
 
@@ -140,7 +152,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
         problem, inputs = problem_of(inputs, init, options, search.num_threads)
         if measures:
             limits = options.max_distance is None
-            problem = tie_points_and_prior.measured(problem, given.tie_points, given.prior, traced, limits)
+            problem = measured(problem, given.tie_points, given.prior, traced, limits)
         return run_loop(inputs, problem, search, options.max_iterations, traced)
 
     if not traced:
@@ -155,9 +167,7 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     doubt = ""
     if not traced and options.has_two_distances:
         first = se3_from_matrix(centred_pose(init, *inputs[:2]), inputs.source.points.dtype) if coarse else None
-        run, doubt = start_check.unless_left(
-            run, first, lambda limit: solve(inputs, init, replace(options, max_distance=limit))
-        )
+        run, doubt = unless_left(run, first, lambda limit: solve(inputs, init, replace(options, max_distance=limit)))
     if equalizes and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run))
@@ -174,10 +184,10 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     if measures:
         run = _fused(run, options, traced)
         limit = run.problem.settings.fine_distance
-        if doubt and start_check.distance_moved(run.problem.start, run.loop.state) > limit:
+        if doubt and distance_moved(run.problem.start, run.loop.state) > limit:
             # It was about another pose; where views have little in common, it is about this one, too.
-            overlap = start_check.surface_fit(run.inputs, run.executor, run.loop).overlap
-            doubt = doubt if overlap < start_check.LITTLE_IN_COMMON else ""
+            overlap = surface_fit(run.inputs, run.executor, run.loop).overlap
+            doubt = doubt if overlap < LITTLE_IN_COMMON else ""
     return run if traced else _with_doubt(run, doubt, measures)
 
 
@@ -189,7 +199,7 @@ def _fused(run: Run, options: Options, traced: bool) -> Run:
     else:
         with outside_trace():
             moments = moments_of(run.executor, run.loop)
-    fusion = tie_points_and_prior.fusion_of(state, moments, run.inputs.tie_points, run.inputs.prior, traced)
+    fusion = fusion_of(state, moments, run.inputs.tie_points, run.inputs.prior, traced)
     if options.max_distance is None:
         settings = settings._replace(max_distance=settings.fine_distance)
     problem = replace(run.problem, start=constant(state.pose), settings=settings, measurements=fusion)
@@ -211,7 +221,7 @@ def _with_doubt(run: Run, doubt: str, measures: bool) -> Run:
                 "or more uncertain"
             )
         else:
-            doubt = sensor_patterns.doubt_of_patterns(run.inputs.source)
+            doubt = doubt_of_patterns(run.inputs.source)
         return run._replace(doubt=doubt)
     if state.status == Status.CONVERGED and doubt:
         state = state._replace(status=np.asarray(Status.UNVERIFIED, np.int32))
@@ -291,7 +301,7 @@ def problem_of(
         compared = method.uses_channels and target.channels.shape[-1] > 0
         soft = compared and matches is None and not any(term.by_position for term in pair.terms)
     observes_channels = method.uses_channels and matches is None and source.channels.shape[-1]
-    may_move = sensor_patterns.channels_may_move(source) if observes_channels else False
+    may_move = channels_may_move(source) if observes_channels else False
     problem = Problem(
         se3_from_matrix(centred_pose(init, source, target), source.points.dtype),
         pair.source,
