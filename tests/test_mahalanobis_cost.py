@@ -289,9 +289,12 @@ def test_padding_of_given_covariances_adds_nothing():
         np.testing.assert_array_equal(gradient[N:], 0)
 
 
-def test_matches_of_another_cloud_are_refused():
+def test_matches_of_another_cloud_and_clouds_that_do_not_fit_are_refused():
     _, _, clouds, matches, _ = problem()
     refused(lambda: mcg.mahalanobis_cost(T, clouds[0].pad(200), clouds[1], matches, mcg.GICP()), "matches")
+    refused(lambda: mcg.mahalanobis_cost(T, *clouds, matches, mcg.GICP), "method")
+    other = clouds[1].replace(channels=clouds[1].channels[:, :1])
+    refused(lambda: mcg.mahalanobis_cost(T, clouds[0], other, matches, mcg.MultiChannelGICP()), "channels")
 
 
 def test_neighbourhoods_of_large_clouds_are_summed_inside_jit():

@@ -25,7 +25,7 @@ from mcgicp_jax._methods.base import AbstractGeneralized, AbstractMethod, with_u
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._methods.surfaces import differentiable_inputs, surface_pair
 from mcgicp_jax._pose_solver.matched import Matches, Motion, adapted, linearize_at, matched_rows, sample_of_term
-from mcgicp_jax._registration.input_checks import check_clouds, check_matches, warn_of_estimated_parameters
+from mcgicp_jax._registration.input_checks import check_matches, warn_of_estimated_parameters
 from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs, Run
 from mcgicp_jax._registration.register_pair import problem_of, result_of, run_loop
@@ -183,7 +183,6 @@ def estimate_pose(
         max_source_points=None,
     )
     check_matches(matches, source, target, method, temperature)
-    check_clouds(source, target, method)
     warn_of_estimated_parameters(method, source, target, soft=temperature is not None)
     source, target, matches = with_constants(source), with_constants(target), concrete.with_numpy_constants(matches)
     softness = None if temperature is None else numpy_for(temperature).asarray(temperature, source.points.dtype)

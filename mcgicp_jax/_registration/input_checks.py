@@ -39,8 +39,9 @@ _SAMPLE, _OUTSIDE = 300, 20
 def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:
     """Raise `ValueError` unless both are single clouds, of one dtype, with channels that fit the method."""
     check_method(method)
-    _check_kinds(source, target)
     for name, cloud in (("source", source), ("target", target)):
+        if not isinstance(cloud, PointCloud):
+            raise ValueError(f"{name}: expected a PointCloud, got {type(cloud).__name__}; is the order right?")
         if cloud.points.ndim != 2:
             raise ValueError(
                 f"{name}: expected a single cloud, got shape {cloud.points.shape}; use jax.vmap for a batch"
@@ -61,12 +62,6 @@ def check_clouds(source: PointCloud, target: PointCloud, method: AbstractMethod)
         )
 
 
-def _check_kinds(source: PointCloud, target: PointCloud) -> None:
-    for name, cloud in (("source", source), ("target", target)):
-        if not isinstance(cloud, PointCloud):
-            raise ValueError(f"{name}: expected a PointCloud, got {type(cloud).__name__}; is the order right?")
-
-
 def check_channels(source: PointCloud, target: PointCloud, method: AbstractMethod) -> None:
     if source.channels.shape[-1] != target.channels.shape[-1]:
         raise ValueError(
@@ -83,11 +78,12 @@ def check_channels(source: PointCloud, target: PointCloud, method: AbstractMetho
 def check_matches(
     matches: Correspondences, source: PointCloud, target: PointCloud, method: AbstractMethod, temperature: Any
 ) -> None:
-    """Raise unless there is one match per source row, or several for a method that uses several or a `temperature`."""
+    """Raise unless there is one match per source row, or several for a method that uses several or a `temperature`, and
+    the clouds are as `check_clouds` expects."""
     if not isinstance(matches, Correspondences):
         kind = type(matches).__name__
         raise ValueError(f"matches: expected the result of find_correspondences, got {kind}; is the order right?")
-    _check_kinds(source, target)
+    check_clouds(source, target, method)
     rows = source.points.shape[0]
     if matches.indices.ndim > 2 or matches.indices.shape[-1] != rows:
         raise ValueError(f"matches: expected one per source row ({rows}), got shape {matches.indices.shape}")
