@@ -119,7 +119,7 @@ def register_as_completed(
         PairWarning: the reason for each pair with the status `INVALID_INPUT`, `WORKER_FAILED` or `UNVERIFIED`, or for
             which `global_pose` finds no pose; a `UserWarning`.
     """
-    checked_options = options_of(register_batch, options)
+    checked_options = options_of(register_as_completed, options)
     job = BatchJob(method, checked_options, voxel_size, num_neighbors, covariances, priors is not None)
     workers, (pairs, count) = executor_of(executor), _pairs(job, sources, targets, init, priors)
     return run(job, pairs, workers, count)
