@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.messages import check_integer, check_positive
-from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix, matrix_of
 
 __all__ = ["ate", "kitti_errors", "pose_error", "rpe"]
 
@@ -46,10 +46,10 @@ def pose_error(T: Pose, T_true: Pose, *, at: ArrayLike | None = None) -> tuple[S
     Raises:
         ValueError: if an argument has the wrong shape or a pose is no rigid motion; the message names the argument.
     """
-    true = pose_matrix(T_true, "T_true")
+    true = checked_pose_matrix(T_true, "T_true")
     estimate = matrix_of(T)
     failed = is_concrete(estimate) and np.shape(estimate) == (4, 4) and np.isnan(estimate[:3]).all()
-    matrix = np.full((4, 4), np.nan) if failed else pose_matrix(T, "T")
+    matrix = np.full((4, 4), np.nan) if failed else checked_pose_matrix(T, "T")
     point: Any = np.zeros(3) if at is None else at
     if np.shape(point) != (3,):
         raise ValueError(f"at: expected a point of shape (3,), got {np.shape(point)}")
@@ -150,7 +150,7 @@ def kitti_errors(
 
 def _trajectories(poses: Poses, true_poses: Poses) -> tuple[Matrices, Matrices]:
     estimated, true = (
-        np.array([pose_matrix(pose, f"{name}[{i}]") for i, pose in enumerate(trajectory)]).reshape(-1, 4, 4)
+        np.array([checked_pose_matrix(pose, f"{name}[{i}]") for i, pose in enumerate(trajectory)]).reshape(-1, 4, 4)
         for name, trajectory in (("poses", poses), ("true_poses", true_poses))
     )
     if len(estimated) != len(true) or not len(true):

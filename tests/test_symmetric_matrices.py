@@ -105,7 +105,7 @@ def test_inverse_inverse_square_root_and_sandwich(seed, scale):
     np.testing.assert_allclose(root @ W @ root, np.broadcast_to(np.eye(2), W.shape), atol=tolerance(1e-4, 1e-12))
     assert np.all(np.linalg.eigvalsh(root) > 0)
     inside, A = random_symmetric(seed + 1, 2, positive(seed + 1, 2))
-    actual = ref.symmetric(jax.jit(cov.sandwich)(outside, inside)) / scale**2
+    actual = ref.symmetric(jax.jit(cov.congruence)(outside, inside)) / scale**2
     np.testing.assert_allclose(actual, W @ A @ W / scale**2, atol=tolerance(1e-6, 1e-14))
 
 

@@ -20,7 +20,7 @@ from mcgicp_jax._compute.messages import warn
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.surfaces import resolved
-from mcgicp_jax._pairs.register import doubt_of_start_pose
+from mcgicp_jax._pairs.register import doubt_of_global_pose
 from mcgicp_jax._pose_solver.degeneracy import as_text
 from mcgicp_jax._registration.options import Options as RegistrationOptions
 from mcgicp_jax._registration.register_pair import prepared, rows_to_match
@@ -69,12 +69,12 @@ class PreparedPair:
             return
         result = mcg.global_pose(*(cli.with_channels(cloud, self.choices.channels) for cloud in self.raw))
         if not result.num_inliers:
-            raise ValueError(doubt_of_start_pose(result))
+            raise ValueError(doubt_of_global_pose(result))
         verdict = "found" if result.success else "ambiguous" if result.ambiguous else "unsure"
         print(f"start:     {verdict}, {result.num_inliers:,} of {result.num_matches:,} features match")
         self.start, self.verified = result.matrix, result.success
         if not result.success:
-            warn(doubt_of_start_pose(result))
+            warn(doubt_of_global_pose(result))
 
     def method(self, name: str) -> AbstractMethod:
         """The method with parameters from the options, or else from the data as in `mcgicp_jax.register`."""

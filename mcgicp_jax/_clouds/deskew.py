@@ -14,7 +14,7 @@ from mcgicp_jax._compute.concrete import is_concrete, numpy_for
 from mcgicp_jax._compute.linear_maps import primal
 from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.threads import with_settings_of_package
-from mcgicp_jax._math.poses import Pose, logarithm, pose_matrix, se3_from_matrix
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix, logarithm, se3_from_matrix
 
 # Odometry deskews a scan up to three times.
 _measured_rows = cached_with_cloud(measured_rows)
@@ -44,7 +44,7 @@ def deskew(cloud: PointCloud, motion: Pose) -> PointCloud:
         raise ValueError(
             "cloud: expected times of its points, PointCloud(points, times=...), got none; preprocess keeps none"
         )
-    matrix, dtype = pose_matrix(motion, "motion"), jax.dtypes.canonicalize_dtype(cloud.points.dtype)
+    matrix, dtype = checked_pose_matrix(motion, "motion"), jax.dtypes.canonicalize_dtype(cloud.points.dtype)
     twist = logarithm(np.asarray(matrix)).astype(dtype) if is_concrete(matrix) else se3_from_matrix(matrix, dtype).log()
     points = (cloud.points + cloud.origin).astype(dtype)
     (shifts,) = blockwise(_shift, twist, Input(points), Input(cloud.times.astype(dtype)[:, None]))

@@ -14,7 +14,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import AbstractLinearMap, primal, with_derivative
 from mcgicp_jax._compute.threads import with_settings_of_package
-from mcgicp_jax._math.poses import Pose, matrices_of, pose_matrix, rotation_from_quaternion, turn_by_quaternion
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix, matrices_of, rotation_from_quaternion, turn_by_quaternion
 
 
 def are_zero(*origins: Array | np.ndarray) -> bool:
@@ -33,7 +33,7 @@ def centred_pose(pose: Pose | None, source: PointCloud, target: PointCloud, name
     if isinstance(pose, jaxlie.SE3) and not is_concrete(pose):
         # Outside of `jit` this compiles nothing.
         pose = pose_in_user_frame(pose, np.zeros(3), np.zeros(3))
-    matrix = pose_matrix(pose, name, distance)
+    matrix = checked_pose_matrix(pose, name, distance)
     if are_zero(source.origin, target.origin):
         return matrix
     # In this form two far origins cancel exactly before either is rotated.

@@ -21,7 +21,7 @@ from mcgicp_jax._compute.concrete import DeferredRows, is_concrete, with_numpy_c
 from mcgicp_jax._compute.messages import check_concrete, messages_named
 from mcgicp_jax._compute.size_classes import size_class
 from mcgicp_jax._compute.threads import with_settings_of_package
-from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix, rotated
 
 if TYPE_CHECKING:
     # Array input: NumPy, JAX or any array-like, or nested lists.
@@ -490,7 +490,7 @@ class PointCloud(eqx.Module):
             ValueError: if a concrete pose is no rigid motion or has another shape, or the cloud is a batch.
         """
         self._check_single()
-        matrix = pose_matrix(pose, "pose")
+        matrix = checked_pose_matrix(pose, "pose")
         xp = np if isinstance(self.points, np.ndarray) and is_concrete(matrix) else jnp
         rotation = xp.asarray(matrix[:3, :3], self.points.dtype)
         points = rotated(np.asarray(self.points), rotation) if xp is np else self.points @ rotation.T

@@ -13,7 +13,7 @@ from mcgicp_jax._clouds.point_cloud import PointCloud, Values, Voxels, as_cloud
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._clouds.voxels import starts_of, voxel_keys
 from mcgicp_jax._compute.messages import check_concrete, check_positive, messages_named
-from mcgicp_jax._math.poses import Pose, pose_matrix, rotated
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix, rotated
 
 
 def merge_clouds(
@@ -51,7 +51,7 @@ def merge_clouds(
         check_concrete(f"poses[{i}]", pose)
         if world is None:
             world = VoxelMap(map_voxel_size(cloud) if voxel_size == "auto" else voxel_size)
-        world.add(name, cloud, np.asarray(pose_matrix(pose, f"poses[{i}]")))
+        world.add(name, cloud, np.asarray(checked_pose_matrix(pose, f"poses[{i}]")))
     if world is None:
         raise ValueError("clouds: expected at least one, got none")
     return world.cloud()

@@ -101,7 +101,7 @@ def with_derivative(values: Sequence[np.ndarray], linear: AbstractLinearMap, inp
     def rule(inputs: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
         # An outer differentiation, even by other inputs, would see constants.
         for array in inputs:
-            once(array)
+            differentiable_once(array)
         outputs = [jnp.asarray(value) for value in values]
         moving = tuple(i for i, tangent in enumerate(tangents) if not is_symbolic_zero(tangent))
         if not moving:
@@ -166,13 +166,13 @@ def is_symbolic_zero(tangent: object) -> bool:
 
 
 @jax.custom_jvp
-def once(value: Any) -> Any:
+def differentiable_once(value: Any) -> Any:
     """The value. Its derivative raises an error, because second derivatives would be wrong."""
     return value
 
 
-@partial(once.defjvp, symbolic_zeros=True)
-def _once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+@partial(differentiable_once.defjvp, symbolic_zeros=True)
+def _differentiable_once_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     if not is_symbolic_zero(tangents[0]):
         raise NotImplementedError("poses have first derivatives only; costs have second ones inside jit alone")
     return primals[0], jnp.zeros_like(primals[0])

@@ -23,7 +23,7 @@ from mcgicp_jax._compute.row_functions import Input, Rows, blockwise
 from mcgicp_jax._compute.tables import BLOCK, blocks
 from mcgicp_jax._global_pose.robust_pose_fit import NUM_MATCHES, PutativeMatches
 from mcgicp_jax._local_geometry.local_geometry import offsets_of, weighted_covariance
-from mcgicp_jax._local_geometry.neighborhoods import neighborhoods, with_near
+from mcgicp_jax._local_geometry.neighborhoods import inputs_of_neighbors, neighborhoods
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._search.kd_tree import nearest_in_position
 
@@ -49,13 +49,13 @@ _MAX_PIXELS = 4.0
 
 def normals_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N 3"]:
     """Unit normals of arbitrary sign."""
-    return blockwise(_normals, np.float32(_NORMAL_RADIUS * voxel_size), *with_near(cloud, False))[0]
+    return blockwise(_normals, np.float32(_NORMAL_RADIUS * voxel_size), *inputs_of_neighbors(cloud, False))[0]
 
 
 def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_size: float) -> Float[np.ndarray, "N 33"]:
     """FPFH: eleven bins for each of the angles α, φ, θ, which add up to two; zero without neighbours in the radius."""
     size, radius = cloud.points.shape[0], np.float32(_RADIUS * voxel_size)
-    inputs = with_near(cloud.replace_rows(channels=normals, channel_valid=None), True)
+    inputs = inputs_of_neighbors(cloud.replace_rows(channels=normals, channel_valid=None), True)
     simple, weights = blockwise(_simple_histograms, radius, *inputs)
     # The point's histogram plus the weighted mean of its neighbours', as a sparse product: gathering takes ten times as
     # long.
@@ -66,7 +66,7 @@ def histograms_of(cloud: PointCloud, normals: Float[np.ndarray, "N 3"], voxel_si
 
 def statistics_of(cloud: PointCloud, voxel_size: float) -> Float[np.ndarray, "N D"]:
     """Mean and standard deviation of each channel within each radius; NaN where no point has the channel."""
-    return blockwise(_statistics, np.float32(voxel_size), *with_near(cloud, True))[0]
+    return blockwise(_statistics, np.float32(voxel_size), *inputs_of_neighbors(cloud, True))[0]
 
 
 def _normals(radius: Float[AnyScalar, ""], points: Rows, neighbors: Rows) -> tuple[Float[Array, "n 3"]]:

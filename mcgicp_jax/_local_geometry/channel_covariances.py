@@ -84,6 +84,6 @@ def multichannel_covariance(
     scale = 1 / jnp.where(spread, trace, 1)
     identity = jnp.array([[1.0], [0.0], [1.0]], weighted.dtype)
     regular = jnp.where(spread, unweighted * scale + _REGULARISATION * identity, identity)
-    change = alg.sandwich(alg.inverse_square_root(regular), (weighted - unweighted) * scale)
+    change = alg.congruence(alg.inverse_square_root(regular), (weighted - unweighted) * scale)
     inside = alg.embed(alg.floor_eigenvalues(change, min_eigenvalue - 1), u, v)
     return plane_covariance(local, epsilon) + inside

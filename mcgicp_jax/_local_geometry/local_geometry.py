@@ -153,7 +153,7 @@ def local_geometries(
         of_target, of_source = side_by_side(calls, num_threads)
     else:
         # A concrete cloud beside a traced one is traced as well, which needs no program of its own.
-        inputs = [nb.of_rows(nb.with_near(cloud, with_channels), part) for cloud, part in sides]
+        inputs = [nb.of_rows(nb.inputs_of_neighbors(cloud, with_channels), part) for cloud, part in sides]
         of_source, of_target = over_both(_geometry, None, *inputs)
     return joined(*of_source), joined(*of_target)
 
@@ -161,7 +161,7 @@ def local_geometries(
 @cached_with_cloud
 def geometry_table(cloud: PointCloud, with_channels: bool) -> ComputedTable:
     """Local geometry in two trees, see `joined`."""
-    return ComputedTable(_geometry, None, nb.with_near(cloud, with_channels), cloud.points.shape[0])
+    return ComputedTable(_geometry, None, nb.inputs_of_neighbors(cloud, with_channels), cloud.points.shape[0])
 
 
 def differentiable_geometry(cloud: PointCloud, fixed: PointCloud, with_channels: bool) -> ComputedTable:

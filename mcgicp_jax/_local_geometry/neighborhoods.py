@@ -94,7 +94,7 @@ class PointRows(NamedTuple):
     few: Any = None  # (N,) whether the cloud has fewer points than `FEW_POINTS`
 
 
-def with_near(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
+def inputs_of_neighbors(cloud: PointCloud, with_channels: bool, with_given: bool = False) -> list[Input]:
     """The points and their neighbours as inputs of a row function, for `neighborhoods`. Without channels, the programs
     do not depend on their number. `with_given` includes the covariances given with the cloud."""
     # Neighbours and `valid`, which differentiation does not trace.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     # A pose that a user passes.
     Pose: TypeAlias = jaxlie.SE3 | Array | np.ndarray
 else:
-    # Not checked at run time: `pose_matrix` has better messages.
+    # Not checked at run time: `checked_pose_matrix` has better messages.
     Pose = Any
 
 # Tolerance on the largest entry of R Rᵀ − I: a matrix typed with four digits still counts as a rotation.
@@ -35,7 +35,7 @@ _LAST_ROW_TOLERANCE = 1e-9
 _DISPLACEMENT_TOLERANCE = 0.1
 
 
-def pose_matrix(
+def checked_pose_matrix(
     pose: Pose | None, name: str = "init", distance: float = 0.0
 ) -> Float[np.ndarray, "4 4"] | Float[Array, "4 4"]:
     """The (4, 4) matrix of a pose: in float64 if the pose is concrete, in its own precision if it is traced.
@@ -82,9 +82,9 @@ def pose_matrix(
 
 
 def pose_matrices(poses: Any, name: str = "poses[{}]") -> Float[np.ndarray, "n 4 4"]:
-    """`pose_matrix` of each concrete pose; `name` has a place for the number of the pose in error messages."""
+    """`checked_pose_matrix` of each concrete pose; `name` has a place for the number of the pose in error messages."""
     if not isinstance(poses, np.ndarray | jax.Array):
-        poses = [pose_matrix(pose, name.format(k)) for k, pose in enumerate(poses)]
+        poses = [checked_pose_matrix(pose, name.format(k)) for k, pose in enumerate(poses)]
     matrices = np.array(poses, np.float64)
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4) or not len(matrices):
         raise ValueError(
@@ -95,7 +95,7 @@ def pose_matrices(poses: Any, name: str = "poses[{}]") -> Float[np.ndarray, "n 4
         exact = (off <= _EXACT) & (np.linalg.det(matrices[:, :3, :3]) > 0)
     exact &= np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
     for k in np.flatnonzero(~exact):
-        matrices[k] = pose_matrix(matrices[k], name.format(k))
+        matrices[k] = checked_pose_matrix(matrices[k], name.format(k))
     return matrices
 
 

@@ -222,7 +222,7 @@ def inverse_square_root(symmetric: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
     return jnp.stack([(c / s + 1) / t, -b / s / t, (a / s + 1) / t])
 
 
-def sandwich(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
+def congruence(outside: Float[Array, "3 N"], inside: Float[Array, "3 N"]) -> Float[Array, "3 N"]:
     """W A W for symmetric 2×2 matrices."""
     p, q, r = outside
     a, b, c = inside

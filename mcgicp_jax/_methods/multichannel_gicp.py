@@ -23,7 +23,7 @@ from mcgicp_jax._local_geometry.channel_covariances import channel_kernel, multi
 from mcgicp_jax._local_geometry.cloud_statistics import channel_noise, point_spacing
 from mcgicp_jax._local_geometry.local_geometry import Geometries, LocalGeometry, local_geometries
 from mcgicp_jax._local_geometry.neighborhoods import NO_NEIGHBORS, Neighborhoods
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix
 from mcgicp_jax._math.robust_kernels import AbstractKernel, positive_scalar
 from mcgicp_jax._methods import base
 from mcgicp_jax._search.kd_tree import nearest_in_position
@@ -218,7 +218,7 @@ def estimate_channel_covariance(
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
         check_concrete(f"clouds[{i}]", cloud)
         check_concrete(f"poses[{i}]", pose)
-    matrices = [np.asarray(pose_matrix(pose, f"poses[{i}]")) for i, pose in enumerate(poses)]
+    matrices = [np.asarray(checked_pose_matrix(pose, f"poses[{i}]")) for i, pose in enumerate(poses)]
     ready = [cloud if cloud.deferred_neighbors is not None else preprocess(cloud, None) for cloud in clouds]
     names = ready[0].channel_names
     for i, cloud in enumerate(ready):

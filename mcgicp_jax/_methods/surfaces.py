@@ -20,7 +20,7 @@ from mcgicp_jax._compute.row_functions import ComputedTable, GivenTable, Input, 
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry import local_geometry as geo
 from mcgicp_jax._local_geometry.local_geometry import LocalGeometry, Surface
-from mcgicp_jax._local_geometry.neighborhoods import PointRows, neighborhoods, of_rows, with_near
+from mcgicp_jax._local_geometry.neighborhoods import PointRows, inputs_of_neighbors, neighborhoods, of_rows
 from mcgicp_jax._local_geometry.observability import channel_observability
 from mcgicp_jax._math import symmetric_matrices as alg
 from mcgicp_jax._math.robust_kernels import AbstractKernel
@@ -277,7 +277,7 @@ def _inputs(
 ) -> list[Input]:
     """Inputs of the row function `surface_of`: the cloud, and its geometry if a table of it is passed."""
     if method.uses_neighborhoods and with_geometry:
-        inputs = with_near(cloud, method.uses_channels, with_given=True)
+        inputs = inputs_of_neighbors(cloud, method.uses_channels, with_given=True)
     else:
         inputs = [Input(PointRows(cloud.points, given=cloud.covariances))]
     return inputs if geometry is None else [*inputs, Input(geometry), Input(geometry, part=1)]

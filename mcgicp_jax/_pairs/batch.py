@@ -13,9 +13,9 @@ from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize
 from mcgicp_jax._compute.concrete import is_concrete
 from mcgicp_jax._compute.linear_maps import primal
-from mcgicp_jax._math.poses import Pose, matrix_of, pose_matrix
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix, matrix_of
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.batch_executors import GivenExecutor, executor_of, run, run_differentiated
+from mcgicp_jax._pairs.batch_executors import GivenExecutor, checked_executor, run, run_differentiated
 from mcgicp_jax._pairs.batch_jobs import BatchJob, Cloud, Pair
 from mcgicp_jax._registration.options import GivenOptions, options_of
 from mcgicp_jax._registration.result import RegistrationResult
@@ -48,7 +48,7 @@ def register_batch(
     """
     checked_options = options_of(register_batch, options)
     job = BatchJob(method, checked_options, voxel_size, num_neighbors, covariances, priors is not None)
-    workers, (pairs, count) = executor_of(executor), _pairs(job, sources, targets, init, priors)
+    workers, (pairs, count) = checked_executor(executor), _pairs(job, sources, targets, init, priors)
     # A look at an iterator would use it up.
     clouds = [side for side in (sources, targets) if isinstance(side, list | tuple | PointCloud)]
     inputs = clouds, job.method, job.options.robust, priors if isinstance(priors, list | tuple) else None
@@ -121,7 +121,7 @@ def register_as_completed(
     """
     checked_options = options_of(register_as_completed, options)
     job = BatchJob(method, checked_options, voxel_size, num_neighbors, covariances, priors is not None)
-    workers, (pairs, count) = executor_of(executor), _pairs(job, sources, targets, init, priors)
+    workers, (pairs, count) = checked_executor(executor), _pairs(job, sources, targets, init, priors)
     return run(job, pairs, workers, count)
 
 
@@ -151,7 +151,7 @@ def _pairs(
             if name in ("sources", "targets"):
                 (value,) = job.ready({name: value})
             elif name == "init" and value is not None and not isinstance(value, str):
-                value = pose_matrix(value)
+                value = checked_pose_matrix(value)
             sides[name] = value
         elif isinstance(value, jaxlie.SE3):
             sides[name] = np.asarray(matrix_of(value))

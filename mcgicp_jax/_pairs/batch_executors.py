@@ -53,7 +53,7 @@ _START, _MEMORY = 3.2, 2**29
 _MEMORY_LIMITS = [pathlib.Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory/memory.limit_in_bytes")]
 
 
-def executor_of(executor: GivenExecutor) -> ChosenExecutor:
+def checked_executor(executor: GivenExecutor) -> ChosenExecutor:
     """The executor to use; `ValueError` unless it is None, "processes", "threads" or an executor that may run JAX."""
     if isinstance(executor, str) and executor == "processes":
         return Processes(num_cores())

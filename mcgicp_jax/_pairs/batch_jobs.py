@@ -27,7 +27,7 @@ from mcgicp_jax._compute.threads import with_settings
 from mcgicp_jax._local_geometry.sensor_patterns import doubt_of_patterns
 from mcgicp_jax._math.poses import Pose, se3_from_matrix
 from mcgicp_jax._methods.base import AbstractMethod
-from mcgicp_jax._pairs.register import doubt_of, doubt_of_start_pose, start_from_anywhere
+from mcgicp_jax._pairs.register import doubt_of, doubt_of_global_pose, start_from_anywhere
 from mcgicp_jax._pose_solver.pose_measurements import Prior
 from mcgicp_jax._registration import input_checks
 from mcgicp_jax._registration.assessment import registration_of
@@ -198,7 +198,7 @@ class BatchJob:
             init = pair.prior[0] if pair.init is None and pair.prior is not None else pair.init
             return PreparedPair(pair.index, inputs, primal(init), pair.prior)
         start, distance = start_from_anywhere(pair.init, primal(source), primal(target), options)
-        doubt = doubt_of_start_pose(start)
+        doubt = doubt_of_global_pose(start)
         if not start.num_inliers:
             return PairResult(pair.index, RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES), doubt)
         return PreparedPair(pair.index, inputs, start.matrix, pair.prior, doubt, distance)

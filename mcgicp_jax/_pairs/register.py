@@ -158,7 +158,7 @@ def register(
         start, distance = start_from_anywhere(init, primal(source), primal(target), options)
         pose, trusted = start.matrix, start.success
         if not trusted:
-            warn(doubt_of_start_pose(start))
+            warn(doubt_of_global_pose(start))
         if not start.num_inliers:
             return RegistrationResult.without_pose(Status.TOO_FEW_CORRESPONDENCES)
         options = replace(options, max_coarse_distance=distance)
@@ -170,7 +170,7 @@ def register(
     return result
 
 
-def doubt_of_start_pose(start: GlobalPoseResult) -> str:
+def doubt_of_global_pose(start: GlobalPoseResult) -> str:
     if start.success:
         return ""
     if start.ambiguous:

@@ -14,7 +14,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from mcgicp_jax._compute.concrete import AnyArray, numpy_for
-from mcgicp_jax._compute.linear_maps import is_symbolic_zero, once
+from mcgicp_jax._compute.linear_maps import differentiable_once, is_symbolic_zero
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._math.poses import parameters_by_twist, units
 from mcgicp_jax._pose_solver.matched import Matched, Motion, linearize_at
@@ -88,7 +88,7 @@ def _with_derivative_jvp(
     moving = [i for i, slope in enumerate(slopes) if not is_symbolic_zero(slope)]
     if not moving:
         return pose, jnp.zeros_like(pose)
-    leaves = [once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
+    leaves = [differentiable_once(leaf) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf for leaf in leaves]
     start, root, constants = jax.lax.stop_gradient((pose, root, leaves))
     at_root, inverse = _newton(start, root, jax.tree.unflatten(structure, constants))
 

@@ -44,7 +44,12 @@ from mcgicp_jax._registration.options import Options
 from mcgicp_jax._registration.pose_derivative import Inputs, Run, jacobian, with_derivatives
 from mcgicp_jax._registration.result import USABLE, RegistrationResult, Status
 from mcgicp_jax._registration.settings import settings_for, spacing_of
-from mcgicp_jax._registration.start_check import LITTLE_IN_COMMON, distance_moved, surface_fit, unless_left
+from mcgicp_jax._registration.start_check import (
+    LITTLE_IN_COMMON,
+    distance_moved,
+    retried_if_start_was_left,
+    surface_fit,
+)
 from mcgicp_jax._registration.tie_points_and_prior import (
     GivenPrior,
     GivenTiePoints,
@@ -167,7 +172,9 @@ def run_pair(given: Inputs, init: Pose | None, options: Options, traced: bool = 
     doubt = ""
     if not traced and options.has_two_distances:
         first = se3_from_matrix(centred_pose(init, *inputs[:2]), inputs.source.points.dtype) if coarse else None
-        run, doubt = unless_left(run, first, lambda limit: solve(inputs, init, replace(options, max_distance=limit)))
+        run, doubt = retried_if_start_was_left(
+            run, first, lambda limit: solve(inputs, init, replace(options, max_distance=limit))
+        )
     if equalizes and not any(term.estimates_gains for term in run.problem.terms):
         # Parameters left None are chosen anew, from the channels as equalised by the matches.
         again = _equalized(run.inputs._replace(method=inputs.method), _nearest_points(run))

@@ -124,7 +124,7 @@ class _Candidate(NamedTuple):
         return f"({numbers})" if len(self.max_distance) > 1 else numbers
 
 
-def unless_left(run: Run, start: jaxlie.SE3 | None, closely: Callable[[float], Run]) -> tuple[Run, str]:
+def retried_if_start_was_left(run: Run, start: jaxlie.SE3 | None, closely: Callable[[float], Run]) -> tuple[Run, str]:
     """The registration, or `closely(max_distance)` from the same start if it may have left a right initial pose and
     surfaces coincide better there (see `doubt_of_start`); and why its pose is ambiguous, or nothing. `start`: the
     initial pose of several scales, of which `run` is the last; None if `run` started there."""

@@ -22,7 +22,7 @@ from mcgicp_jax._compute.messages import check_concrete, check_positive, message
 from mcgicp_jax._compute.threads import ReadAhead
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._local_geometry.local_geometry import geometry_table
-from mcgicp_jax._math.poses import Pose, exponential, logarithm, nearest_rotation, pose_matrix
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix, exponential, logarithm, nearest_rotation
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._pairs.register import doubt_of
 from mcgicp_jax._pose_graph.graph import PoseGraph
@@ -172,8 +172,8 @@ def odometry(
         recover=recover,
         loops=loops,
         in_hindsight=deskew and init is None,
-        pose=np.asarray(pose_matrix(start, "start")),
-        motion=pose_matrix(init),
+        pose=np.asarray(checked_pose_matrix(start, "start")),
+        motion=checked_pose_matrix(init),
     )
 
 
@@ -197,7 +197,7 @@ class _Reader:
         if prior is not None:
             if not isinstance(prior, tuple | list) or len(prior) != 2:
                 raise ValueError(f"priors[{number}]: expected (pose, covariance) or None for each frame, got {prior!r}")
-            prior = pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
+            prior = checked_pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
         cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
         check_concrete(name, cloud)
         if self.deskew and cloud.times is None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from mcgicp_jax._math.poses import matrices_of, parameters_of, pose_matrices, pose_matrix
+from mcgicp_jax._math.poses import checked_pose_matrix, matrices_of, parameters_of, pose_matrices
 from mcgicp_jax._pose_graph.edge import WORLD, Edge
 from mcgicp_jax._pose_graph.graph import PoseGraph
 from mcgicp_jax.io.files import open_text, replacing
@@ -42,7 +42,7 @@ def read_poses(path: str | os.PathLike[str]) -> Float[np.ndarray, "N 4 4"]:
         lines = [line for line in file if line.split("#")[0].strip()]
         poses = _poses_of(np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 0)))
     for i, pose in enumerate(poses):
-        pose_matrix(pose, f"{path}: pose {i}")
+        checked_pose_matrix(pose, f"{path}: pose {i}")
     return poses
 
 
@@ -89,7 +89,7 @@ def write_poses(
         OSError: if the file cannot be written.
         ValueError: if a pose is no rigid motion, or there are not as many timestamps as poses.
     """
-    matrices = np.array([pose_matrix(pose, f"poses[{i}]") for i, pose in enumerate(poses)]).reshape(-1, 4, 4)
+    matrices = np.array([checked_pose_matrix(pose, f"poses[{i}]") for i, pose in enumerate(poses)]).reshape(-1, 4, 4)
     rows = matrices[:, :3].reshape(-1, 12)
     if timestamps is not None:
         times = np.asarray(timestamps, np.float64)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix
 from mcgicp_jax._pose_graph.edge import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
 from mcgicp_jax.plot.drawing import Figure, File, new_figure, plotting, saved
@@ -33,7 +33,9 @@ def trajectories(
     figure, panel = _chart()
     plane, start = None, None
     for name, poses in trajectories.items():
-        positions = np.array([pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)])
+        positions = np.array(
+            [checked_pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)]
+        )
         if not len(positions):
             raise ValueError(f"trajectories[{name!r}]: expected at least one pose, got none")
         if plane is None or start is None:

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 import mcgicp_jax.plot.drawing as drawing
 from mcgicp_jax._clouds.point_cloud import PointCloud
 from mcgicp_jax._clouds.voxel_size import raw_spacing
-from mcgicp_jax._math.poses import Pose, pose_matrix
+from mcgicp_jax._math.poses import Pose, checked_pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
 from mcgicp_jax._methods.surfaces import covariances_of
 from mcgicp_jax.plot.drawing import Figure, File, Map, Picture, Points, View
@@ -56,7 +56,7 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         kind = type(poses).__name__
         raise ValueError(f'poses: expected poses by name, such as {{"GICP": result.matrix}}, got {kind}')
     poses = {"start": np.eye(4)} | dict(poses)
-    matrices = {name: pose_matrix(pose, f"poses[{name!r}]") for name, pose in poses.items()}
+    matrices = {name: checked_pose_matrix(pose, f"poses[{name!r}]") for name, pose in poses.items()}
     source, target = drawing.drawable(source), drawing.drawable(target)
     if len(target) < 3:
         raise ValueError(f"target: expected at least 3 points, got {len(target)}")
