@@ -164,31 +164,36 @@ def test_a_pose_has_a_derivative_by_raw_points_and_tells_what_does_not_fit():
     assert all(np.isfinite(slope).all() for slope in slopes)
 
 
-@pytest.mark.parametrize("method", [mcg.GICP(), mcg.MultiChannelGICP()], ids=["gicp", "mc-gicp"])
-def test_clouds_of_one_program_may_be_constants_of_another(method):
+def pose_of(source, target, method):
+    return mcg.register(source, target, method, max_distance=0.5, max_iterations=2).matrix
+
+
+def cost_of(source, target, method):
+    matches = mcg.find_correspondences(source, target, None, method, max_distance=0.5)
+    return mcg.mahalanobis_cost(np.eye(4), source, target, matches, method)
+
+
+@pytest.mark.parametrize(
+    ("function", "method"),
+    [(pose_of, mcg.MultiChannelGICP()), (cost_of, mcg.MultiChannelGICP()), (cost_of, mcg.GICP())],
+    ids=["pose, mc-gicp", "cost, mc-gicp", "cost, gicp"],
+)
+def test_clouds_of_one_program_may_be_constants_of_another(function, method):
     """JAX's arrays, on which any operation would be traced."""
     source, target = (averaged_inside(*surface(seed=seed)) for seed in (0, 1))
-    options = {"max_distance": 0.5, "max_iterations": 2}
-
-    def pose(source, target):
-        return mcg.register(source, target, method, **options).matrix
-
-    def cost(source, target):
-        matches = mcg.find_correspondences(source, target, None, method, max_distance=0.5)
-        return mcg.mahalanobis_cost(np.eye(4), source, target, matches, method)
 
     def moved(points):
         return source.replace_rows(points=points)
 
     # Of both clouds: computed while the program is traced.
-    for function in (pose, cost):
-        constant = jax.jit(lambda offset, function=function: function(source, target) + offset)(0.0)
-        np.testing.assert_allclose(constant, function(source, target), rtol=1e-6, atol=1e-6)
-        jax.eval_shape(lambda points, function=function: function(moved(points), target), source.points)
-        jax.eval_shape(lambda points, function=function: function(target, moved(points)), source.points)
-    # Arrays of both kinds, as after `replace`.
-    mixed = source.replace_rows(points=np.asarray(source.points))
-    jax.eval_shape(lambda points: pose(mixed, target.replace_rows(points=points)), target.points)
+    constant = jax.jit(lambda offset: function(source, target, method) + offset)(0.0)
+    np.testing.assert_allclose(constant, function(source, target, method), rtol=1e-6, atol=1e-6)
+    jax.eval_shape(lambda points: function(moved(points), target, method), source.points)
+    jax.eval_shape(lambda points: function(target, moved(points), method), source.points)
+    if function is pose_of:
+        # Arrays of both kinds, as after `replace`.
+        mixed = source.replace_rows(points=np.asarray(source.points))
+        jax.eval_shape(lambda points: pose_of(mixed, target.replace_rows(points=points), method), target.points)
 
 
 def test_what_is_missing_is_said():
