@@ -341,8 +341,8 @@ def test_neighbourhoods_of_pairs_that_a_worker_differentiates_are_looked_at(clou
     points, channels = (np.repeat(array, 2, axis=0) for array in (clouds[0].points, clouds[0].channels))
 
     def loss(points):
-        options = HARD | {"executor": worker, "voxel_size": None}
-        (result,) = mcg.register_batch([mcg.PointCloud(points, channels)], [clouds[1]], METHOD, **options)
+        options = {"executor": worker, "voxel_size": None, "max_distance": GATE}
+        (result,) = mcg.register_batch([mcg.PointCloud(points, channels)], [clouds[1]], mcg.GICP(), **options)
         return weigh(result.matrix)
 
     with ThreadPoolExecutor(1) as worker, pytest.warns(UserWarning, match="^pair 0: source: .* exactly on another"):

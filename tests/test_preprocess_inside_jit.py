@@ -189,11 +189,9 @@ def test_clouds_of_one_program_may_be_constants_of_another(function, method):
     constant = jax.jit(lambda offset: function(source, target, method) + offset)(0.0)
     np.testing.assert_allclose(constant, function(source, target, method), rtol=1e-6, atol=1e-6)
     jax.eval_shape(lambda points: function(moved(points), target, method), source.points)
-    jax.eval_shape(lambda points: function(target, moved(points), method), source.points)
-    if function is pose_of:
-        # Arrays of both kinds, as after `replace`.
-        mixed = source.replace_rows(points=np.asarray(source.points))
-        jax.eval_shape(lambda points: pose_of(mixed, target.replace_rows(points=points), method), target.points)
+    # Arrays of both kinds, as after `replace`.
+    mixed = target.replace_rows(points=np.asarray(target.points))
+    jax.eval_shape(lambda points: function(mixed, moved(points), method), source.points)
 
 
 def test_what_is_missing_is_said():
