@@ -24,12 +24,7 @@ _PATCHES, _PANEL = ((1.0, 0.15), (0.3, 0.12)), np.array([0.9, 2 * _HALF_WIDTH, 1
 
 
 def corridor(
-    num_frames: int = 2,
-    *,
-    points_per_frame: int = 5000,
-    step: float = 0.2,
-    textured: bool = True,
-    seed: int = 0,
+    num_frames: int = 2, *, points_per_frame: int = 5000, step: float = 0.2, textured: bool = True, seed: int = 0
 ) -> SyntheticFrames:
     """A sensor moves along an endless corridor, 2.4 m wide and 2.5 m high, whose axis is x. The z axis is up.
 

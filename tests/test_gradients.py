@@ -175,10 +175,6 @@ def test_gradient_by_every_input_agrees_with_central_differences(name, way):
         assert np.abs(gradient["method"].channel_weights).min() > 1e-4 and gradient["temperature"] != 0
 
 
-def sides(clouds):
-    return zip(("source", "target"), clouds, strict=True)
-
-
 @pytest.fixture(scope="module")
 def padded(noisy):
     return [cloud.pad(PADDED) for cloud in noisy[:2]]
@@ -519,13 +515,12 @@ def test_nested_differentiation_is_refused(clouds):
             jax.grad(inner)(1.0)
 
 
-def pose_in_x(clouds, points, **options):
-    moved = clouds[0].replace(points=points), clouds[1]
-    return mcg.register(*moved, mcg.PointToPoint(), **{"max_distance": GATE} | options).matrix[0, 3]
-
-
 def test_options_are_constants_wherever_they_come_from(clouds):
-    loss, points = partial(pose_in_x, clouds), clouds[0].points
+    def loss(points, **options):
+        moved = clouds[0].replace(points=points), clouds[1]
+        return mcg.register(*moved, mcg.PointToPoint(), **{"max_distance": GATE} | options).matrix[0, 3]
+
+    points = clouds[0].points
     expected = jax.grad(loss)(points)
     for name, value in (("max_distance", GATE), ("rotation_tolerance", 5e-4), ("init", np.eye(4))):
         derived = jax.grad(lambda points, name=name, value=value: loss(points, **{name: value + 0 * points[0, 0]}))
@@ -582,7 +577,7 @@ def test_what_is_constant_to_a_gradient_is_warned_of_once(of, method, by, option
     def loss(inputs):
         return answer(of, clouds_with(inputs, *clouds), method, matches, **options)[0]
 
-    inputs = {f"{side} {by}": getattr(cloud, by) for side, cloud in sides(clouds)}
+    inputs = {f"{side} {by}": getattr(cloud, by) for side, cloud in zip(("source", "target"), clouds, strict=True)}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         jax.vjp(loss, inputs)

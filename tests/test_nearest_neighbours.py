@@ -88,10 +88,7 @@ def test_trees_hold_few_of_many_equal_points(k, monkeypatch):
 
 @settings(max_examples=25, deadline=None)
 @given(
-    seed=st.integers(0, 2**31),
-    high=st.integers(2, 6),
-    num_channels=st.integers(0, 3),
-    k=st.sampled_from([1, 2, 7, 60]),
+    seed=st.integers(0, 2**31), high=st.integers(2, 6), num_channels=st.integers(0, 3), k=st.sampled_from([1, 2, 7, 60])
 )
 def test_nearest_with_ties_in_position_and_channels(seed, high, num_channels, k):
     """Candidates by distance and row; −1 where the target has no more points."""

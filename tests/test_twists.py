@@ -4,14 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcgicp_jax._math.poses import (
-    adjoint,
-    exponential,
-    inverse,
-    logarithm,
-    logarithm_derivative,
-    translation_adjoint,
-)
+from mcgicp_jax._math.poses import adjoint, exponential, inverse, logarithm, logarithm_derivative, translation_adjoint
 from tests import reference
 
 
