@@ -198,9 +198,12 @@ def test_rounding_does_not_contradict_precise_tie_points(corner):
     moved = points @ turn[:3, :3].T + turn[:3, 3]
     source, target = (mcg.preprocess(mcg.PointCloud(side, cloud.channels), None) for side in (points, moved))
     ties = points[:1800:300], moved[:1800:300], np.tile(1e-12 * np.eye(3), (6, 1, 1))
-    outside = mcg.register(source, target, mcg.GICP(), init=turn, tie_points=ties, max_distance=20.0)
+    options = {"init": turn, "tie_points": ties, "max_distance": 20.0}
+    outside = mcg.register(source, target, mcg.GICP(), **options)
     inside = status_inside(source, target, turn, ties, max_distance=20.0)
     assert outside.status is Status(int(inside)) is Status.CONVERGED
+    # They may be constants of a program, too.
+    jax.eval_shape(lambda cloud: mcg.register(cloud, target, mcg.GICP(), **options).status_code, source)
 
 
 def test_tie_points_at_large_coordinates_lose_nothing(corner):
