@@ -10,7 +10,7 @@ from tests.scenes import pair
 
 PACKAGE = str(pathlib.Path(mcg.__file__).parent)
 # Calls of functions of the package, different ones, and those within each other. They may fall, but not rise.
-LIMITS = (543, 151, 18)
+LIMITS = (429, 136, 18)
 
 
 def passed_through(call):
