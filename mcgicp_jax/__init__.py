@@ -144,4 +144,4 @@ __all__ = [
     "rgb_to_yuv",
     "voxel_gaussians",
 ]
-__version__ = "0.7.0"
+__version__ = "0.7.1"
