@@ -64,6 +64,9 @@ def test_arguments_that_are_swapped_or_in_the_wrong_form_are_named():
         ("channel_names", lambda: raw.replace(channels=POINTS, channel_names=()), 3, 0),
         ("channel_names", lambda: raw.replace(channels=POINTS, channel_names=("a", "b", "a")), "different names"),
         ("points", lambda: mcg.PointCloud((POINTS > 0).tolist()), "bool"),
+        ("frames", lambda: mcg.odometry("scans", method), "mcgicp_jax.datasets.clouds('scans')"),
+        ("photometric", lambda: mcg.MultiChannelGICP(photometric="no"), "'no'"),
+        ("clouds[1]", lambda: mcg.PointCloud.stack([raw, "b.ply"]), "mcgicp_jax.io.read('b.ply')"),
     ):
         refused(call, named, *told)
     with pytest.raises(AttributeError, match=r"^points: .* cloud\.replace\(points=\.\.\.\)"):

@@ -111,6 +111,11 @@ def test_poses_without_overlap_and_odd_clouds_are_drawn(wall):
     plot.before_after(PointCloud(np.zeros((0, 3))), PointCloud(np.ones((5, 3))), {})
 
 
+def test_arrays_are_clouds():
+    points = np.asarray(CLOUD.unpad().points)
+    assert len(plot.clouds(points).data) == 1 and plot.maps({"points": points}).axes
+
+
 def test_padding_and_origin_change_nothing(wall):
     source, target, truth = wall
     utm = motion((4e5, 5e6, 100.0, 0, 0, 0))
@@ -130,6 +135,9 @@ def test_what_cannot_be_drawn_is_named():
         ("names", 2, lambda: plot.clouds(CLOUD, CLOUD, names=["one"])),
         ("trajectories['none']", "", lambda: plot.trajectories({"none": []})),
         ("maps", "", lambda: plot.maps({})),
+        ("maps", "list", lambda: plot.maps([CLOUD])),
+        ("maps['bare']", "(5,)", lambda: plot.maps({"bare": np.zeros(5)})),
+        ("trajectories", "ndarray", lambda: plot.trajectories(np.eye(4))),
         ("covariances['short']", "(3, 3,", lambda: plot.surface_covariances(CLOUD, {"short": WRONG}, indices=[0])),
     ):
         refused(draw, named, shown)

@@ -232,7 +232,7 @@ def _follow(
             raise
         failure = "interrupted" if isinstance(error, KeyboardInterrupt) else f"{frames.name(len(poses))}: {error}"
     if num_lost:
-        print(f"lost:      {num_lost} of {len(poses)} frames, whose poses are not known")
+        print(f"lost:      {num_lost} of {len(poses)} frames, to which the motion is not known")
     if loops and last is not None:
         graph: Any = last.graph
         print(f"loops:     {int(np.asarray(graph.edges.uncertain).sum())} closed")

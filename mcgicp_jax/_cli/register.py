@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from jaxtyping import Float
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli import options as cli
-from mcgicp_jax._compute.messages import warn
+from mcgicp_jax._compute.messages import warn, warnings_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._methods.surfaces import resolved
@@ -242,9 +243,12 @@ def _compare(
         if name not in methods:
             print(f"{name:{width}}  left out: {reasons.get(name, 'no channels in common')}")
             continue
-        pair.register(name, methods[name])
-        begin = time.perf_counter()
-        result = results[name] = pair.register(name, methods[name])
+        # The first call has warned.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            pair.register(name, methods[name])
+            begin = time.perf_counter()
+            result = results[name] = pair.register(name, methods[name])
         milliseconds = 1e3 * (time.perf_counter() - begin)
         values = f"{result.num_inliers:9,}  {result.rmse:11.4g}"
         if true_pose is not None:
@@ -266,7 +270,8 @@ def _compiled(pair: PreparedPair, names: Sequence[str]) -> tuple[dict[str, Abstr
                 method = pair.method(name)
                 # Clouds may have too few points for cells.
                 try:
-                    pair.register(name, method)
+                    with warnings_named(name):
+                        pair.register(name, method)
                     methods[name] = method
                 except ValueError as error:
                     reasons[name] = str(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import FrozenInstanceError, dataclass
 from functools import partial
@@ -515,6 +516,7 @@ class PointCloud(eqx.Module):
         """
         if not clouds:
             raise ValueError("clouds: expected at least one, got none")
+        clouds = [as_cloud(f"clouds[{i}]", cloud) for i, cloud in enumerate(clouds)]
         size = max(size_class(cloud.points.shape[0]) for cloud in clouds)
 
         def kind(cloud: PointCloud) -> str:
@@ -569,6 +571,9 @@ def with_constants(cloud: PointCloud) -> PointCloud:
 
 
 def check_several(name: str, clouds: object) -> None:
+    if isinstance(clouds, str | os.PathLike):
+        reader = f"mcgicp_jax.datasets.clouds({str(clouds)!r})"
+        raise ValueError(f"{name}: expected a sequence of clouds, got a path; {reader} reads those of a folder")
     if isinstance(clouds, PointCloud | Frame) or getattr(clouds, "ndim", None) == 2:
         raise ValueError(f"{name}: expected a sequence of clouds, got one {type(clouds).__name__}; pass a list")
 

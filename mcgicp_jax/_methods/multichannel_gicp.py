@@ -95,7 +95,9 @@ class MultiChannelGICP(base.AbstractGeneralized):
         self.channel_weights = None if channel_weights is None else base.weights_of(channel_weights)
         self.epsilon = None if epsilon is None else base.epsilon_of(epsilon)
         self.min_eigenvalue = None if min_eigenvalue is None else positive_scalar("min_eigenvalue", min_eigenvalue)
-        self.photometric = photometric
+        if not isinstance(photometric, bool | np.bool_):
+            raise ValueError(f"photometric: expected True or False, got {photometric!r}")
+        self.photometric = bool(photometric)
 
     @with_settings_of_package
     def resolve(self, source: PointCloud, target: PointCloud, geometries: Geometries | None = None) -> MultiChannelGICP:

@@ -250,9 +250,9 @@ def _choice_of(candidates: list[_Candidate], doubt: Doubt, fine: float) -> tuple
     another = "another that is still changing" if unsettled else "another"
     coincide = "" if unsettled or doubt.little else ", where the surfaces coincide about as well"
     # Two distances would lead to the same doubt.
-    advice = f"max_distance={nearest.limit} if the initial pose is good to {fine:.2g} m, or else "
+    advice = f"max_distance={nearest.limit} if the initial pose is off by less than that, or else "
     return best.run, (
-        f"{common}max_distance={best.limit} leads to this pose, {best.moved:.2g} m from the initial one, but "
+        f"{common}max_distance={best.limit} leads to this pose, which moves points by {best.moved:.2g} m, but "
         f"max_distance={rival.limit} to {another}, {distance:.2g} m from this one{coincide}. Pass "
         f"{advice if len(nearest.max_distance) == 1 else ''}a better init"
     )

@@ -16,7 +16,7 @@ from mcgicp_jax._clouds.preprocess import check_preprocessing, preprocess
 from mcgicp_jax._clouds.voxel_map import merge_clouds
 from mcgicp_jax._clouds.voxel_size import NUM_NEIGHBORS, VoxelSize, voxels_for
 from mcgicp_jax._clouds.voxels import wrapped_keys
-from mcgicp_jax._compute.messages import check_concrete, messages_named
+from mcgicp_jax._compute.messages import check_concrete, messages_named, warnings_named
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
 from mcgicp_jax._math.poses import Pose, exponential, logarithm, pose_matrices, rotated
 from mcgicp_jax._methods.base import AbstractMethod
@@ -192,7 +192,10 @@ def _chained(
         rows = range(max(k - 2, 0), k)
         starts = [exponential((k - i) * steps[i]) for i in rows]
         targets = zip(rows, starts, strict=True)
-        results = [register_pair(clouds[k], clouds[i], method, start, options) for i, start in targets]
+        results = []
+        for i, start in targets:
+            with warnings_named(f"clouds[{k}] to clouds[{i}]"):
+                results.append(register_pair(clouds[k], clouds[i], method, start, options))
         # Overlap per distance of the matches, 1/m; 0 without a pose. MAX_ITERATIONS has one: on sparse points, updates
         # may oscillate about the right pose.
         with np.errstate(divide="ignore"):

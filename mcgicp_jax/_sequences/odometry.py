@@ -51,8 +51,8 @@ class OdometryStep:
     Attributes:
         pose: (4, 4) float64, sensor to world, metres.
         cloud: the preprocessed cloud, in the sensor's frame.
-        lost: whether the pose in the world is unknown: extrapolated, since the frame could not be registered, or with
-            `recover`, derived from an extrapolated one by registrations to the previous frame.
+        lost: whether the motion to this frame is unknown and was extrapolated; poses after it in the world have its
+            error. With `recover`, also whether the pose is derived from such a one, until a frame is found again.
         deferred_registration, deferred_graph: values of the properties.
     """
 
@@ -102,8 +102,9 @@ def odometry(
 ) -> Iterator[OdometryStep]:
     """Register each frame to the previous one, or to a map, starting from the previous motion (constant velocity).
 
-    If a registration has too few matches or non-finite values, its result is not used: the sensor is taken to repeat
-    the previous motion.
+    If a registration has too few matches or non-finite values, or is UNVERIFIED because another pose fits as well, its
+    result is not used: the sensor is taken to repeat the previous motion. Frames after that are registered to this one,
+    so that their poses in the world have its error.
 
     Args:
         frames: iterable of `datasets.Frame`, `PointCloud` or (N, 3) arrays in metres; consumed lazily: while a frame is
@@ -143,8 +144,8 @@ def odometry(
             the iteration may go on with the next one: that one is registered to the last valid frame.
 
     Warns:
-        UserWarning: on iteration without `recover`, if a frame cannot be registered, or less than 10 % of its points
-            have a match (UNVERIFIED; its pose is used). The next one is registered to it all the same.
+        UserWarning: on iteration without `recover`, if the result of a frame is not used, or if less than 10 % of its
+            points have a match (UNVERIFIED, but used). The next one is registered to it all the same.
     """
     check_preprocessing(voxel_size, num_neighbors)
     check_method(method)
@@ -193,10 +194,11 @@ class _Reader:
         """Name, cloud and prior of the next frame; the cloud is raw if it is to be deskewed."""
         number, frame = next(self.frames)
         name = f"frames[{number}]"
-        prior = None if self.priors is None else next(self.priors, "no more")
+        missing = "none: there are fewer priors than frames"
+        prior = None if self.priors is None else next(self.priors, missing)
         if prior is not None:
             if not isinstance(prior, tuple | list) or len(prior) != 2:
-                raise ValueError(f"priors[{number}]: expected (pose, covariance) or None for each frame, got {prior!r}")
+                raise ValueError(f"priors[{number}]: expected (pose, covariance) or None for each frame, got {prior}")
             prior = checked_pose_matrix(prior[0], f"priors[{number}]: pose"), prior[1]
         cloud = as_cloud(name, frame.cloud if isinstance(frame, Frame) else frame)
         check_concrete(name, cloud)

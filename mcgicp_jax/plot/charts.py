@@ -11,7 +11,7 @@ from jaxtyping import Float
 from mcgicp_jax._math.poses import Pose, checked_pose_matrix
 from mcgicp_jax._pose_graph.edge import WORLD
 from mcgicp_jax._pose_graph.optimize import PoseGraphResult
-from mcgicp_jax.plot.drawing import Figure, File, new_figure, plotting, saved
+from mcgicp_jax.plot.drawing import Figure, File, by_name, new_figure, plotting, saved
 
 # Residual at the end of the colour scale of a graph, standard deviations: loops beyond it are rejected.
 _LARGEST_RESIDUAL = 4.1
@@ -32,7 +32,7 @@ def trajectories(
     """
     figure, panel = _chart()
     plane, start = None, None
-    for name, poses in trajectories.items():
+    for name, poses in by_name("trajectories", trajectories, '{"odometry": poses}').items():
         positions = np.array(
             [checked_pose_matrix(pose, f"trajectories[{name!r}][{i}]")[:3, 3] for i, pose in enumerate(poses)]
         )

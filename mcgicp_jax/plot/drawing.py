@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mcgicp_jax._clouds.columns import COLORS
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._compute.messages import optional_module
 
 if TYPE_CHECKING:
@@ -112,9 +113,16 @@ def paint(view: View, points: Points, colors: Points) -> Picture:
     return np.where(distance[..., None] <= PIXELS_PER_SPACING, picture[row, column], np.nan)
 
 
-def drawable(cloud: PointCloud) -> PointCloud:
+def by_name(name: str, values: Any, example: str) -> dict[str, Any]:
+    """A mapping as a dictionary; `ValueError` with an example for anything else."""
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{name}: expected {name} by name, such as {example}, got {type(values).__name__}")
+    return dict(values)
+
+
+def drawable(name: str, cloud: PointCloud | Values) -> PointCloud:
     """The finite points and their channels, as NumPy arrays in float64."""
-    cloud = cloud.unpad()
+    cloud = as_cloud(name, cloud).unpad()
     points = np.asarray(cloud.points, np.float64)
     return cloud.replace_rows(points=points, valid=np.isfinite(points).all(axis=1), covariances=None).unpad()
 

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 import mcgicp_jax.plot.drawing as drawing
-from mcgicp_jax._clouds.point_cloud import PointCloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
 from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._math.poses import Pose, checked_pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
@@ -52,12 +52,9 @@ def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pos
         ValueError: if a pose is no rigid motion, or the target has fewer than 3 points.
         ImportError: if matplotlib is missing.
     """
-    if not isinstance(poses, Mapping):
-        kind = type(poses).__name__
-        raise ValueError(f'poses: expected poses by name, such as {{"GICP": result.matrix}}, got {kind}')
-    poses = {"start": np.eye(4)} | dict(poses)
+    poses = {"start": np.eye(4)} | drawing.by_name("poses", poses, '{"GICP": result.matrix}')
     matrices = {name: checked_pose_matrix(pose, f"poses[{name!r}]") for name, pose in poses.items()}
-    source, target = drawing.drawable(source), drawing.drawable(target)
+    source, target = drawing.drawable("source", source), drawing.drawable("target", target)
     if len(target) < 3:
         raise ValueError(f"target: expected at least 3 points, got {len(target)}")
     moved = {name: np.asarray(source.transform(matrix).unpad().points) for name, matrix in matrices.items()}
@@ -174,7 +171,8 @@ def maps(
         ValueError: if there are no clouds, or the first has fewer than 3 points.
         ImportError: if matplotlib is missing.
     """
-    drawn = {name: drawing.drawable(cloud) for name, cloud in maps.items()}
+    maps = drawing.by_name("maps", maps, '{"map": cloud}')
+    drawn = {name: drawing.drawable(f"maps[{name!r}]", cloud) for name, cloud in maps.items()}
     first = next(iter(drawn.values()), None)
     if first is None or len(first) < 3:
         raise ValueError("maps: expected at least one cloud, the first with at least 3 points")
@@ -216,7 +214,9 @@ def surface_covariances(
         ImportError: if matplotlib is missing.
     """
     collections = drawing.plotting("matplotlib.collections")
-    raw, rows = drawing.drawable(cloud), np.asarray(indices, int)
+    covariances = drawing.by_name("covariances", covariances, '{"GICP": mcgicp_jax.GICP()}')
+    cloud = as_cloud("cloud", cloud)
+    raw, rows = drawing.drawable("cloud", cloud), np.asarray(indices, int)
     view = drawing.view_onto(np.asarray(raw.points), _PIXELS, limits)
     # The indices refer to the rows of `cloud`; `raw`, which the picture shows, lacks padding and non-finite points.
     centers = cloud.coordinates[rows]
@@ -287,7 +287,7 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
     layout = {"scene": {"aspectmode": "data"}, "legend": {"itemsizing": "constant"}, "margin": dict.fromkeys("lrtb", 0)}
     figure = graphs.Figure(layout=layout)
     for i, (cloud, name) in enumerate(zip(clouds, names, strict=True)):
-        cloud = drawing.drawable(cloud)
+        cloud = drawing.drawable(f"clouds[{i}]", cloud)
         rows = np.random.default_rng(0).permutation(len(cloud))[: round(fraction * len(cloud))]
         rgb, intensity = drawing.rgb_of(cloud), drawing.channels_of(cloud, ("intensity",))
         marker: dict[str, Any] = {"size": 1.5, "color": _COLORS[i % len(_COLORS)]}
