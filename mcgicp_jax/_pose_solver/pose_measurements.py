@@ -124,7 +124,7 @@ class PoseMeasurements(eqx.Module):
     radius: Float[AnyScalar, ""]
     form: PoseForm
 
-    def _change(self, motion: Motion) -> tuple[Float[Array, "3 4"], Float[Array, "3"]]:
+    def _change(self, motion: Motion) -> tuple[Float[AnyArray, "3 4"], Float[AnyArray, "3"]]:
         """[ΔR | Δt] of a pose, Δt in units of the radius; and Δt in metres."""
         turn = motion.rotation @ self.rotation.T
         shift = motion.translation - self.center - turn @ (self.translation - self.center)

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 
 import mcgicp_jax.plot.drawing as drawing
-from mcgicp_jax._clouds.point_cloud import PointCloud, as_cloud
+from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud
 from mcgicp_jax._clouds.voxel_size import raw_spacing
 from mcgicp_jax._math.poses import Pose, checked_pose_matrix
 from mcgicp_jax._methods.base import AbstractMethod
@@ -32,7 +32,9 @@ _MOST_POINTS = 50_000
 _COLORS = ("#1f77d0", "#e8741c", "#2b9c5a", "#b03a8c", "#7a5230", "#707070")
 
 
-def before_after(source: PointCloud, target: PointCloud, poses: Mapping[str, Pose], *, path: File = None) -> Figure:
+def before_after(
+    source: PointCloud | Values, target: PointCloud | Values, poses: Mapping[str, Pose], *, path: File = None
+) -> Figure:
     """Compare poses: one row per pose shows the transformed source with the target, along the target's thinnest axis.
 
     If all points have the channels red, green and blue, target and source alternate in a checkerboard, in which
@@ -155,7 +157,7 @@ def _ink(view: View, points: Points, size: float) -> Map:
 
 
 def maps(
-    maps: Mapping[str, PointCloud], *, limits: Float[np.ndarray, "2 2"] | None = None, path: File = None
+    maps: Mapping[str, PointCloud | Values], *, limits: Float[np.ndarray, "2 2"] | None = None, path: File = None
 ) -> Figure:
     """Draw clouds of a common world, one panel each, along the thinnest principal axis of the first cloud.
 
@@ -190,7 +192,7 @@ def maps(
 
 
 def surface_covariances(
-    cloud: PointCloud,
+    cloud: PointCloud | Values,
     covariances: Mapping[str, AbstractMethod | Float[ArrayLike, "N 3 3"]],
     *,
     indices: Sequence[int] | Int[np.ndarray, "M"],
@@ -266,7 +268,7 @@ def _shaded(cloud: PointCloud, view: View) -> Picture:
     return np.nan_to_num(drawing.paint(view, points, np.nan_to_num(colors, nan=0.5)), nan=1)
 
 
-def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.graph_objects.Figure:
+def clouds(*clouds: PointCloud | Values, names: Sequence[str] | None = None) -> plotly.graph_objects.Figure:
     """Show clouds in one 3-D view, coloured by red, green and blue, else by intensity, else in one colour per cloud.
 
     If the clouds have more than 50,000 points in total, a reproducible random subset of that size is drawn.
@@ -283,11 +285,11 @@ def clouds(*clouds: PointCloud, names: Sequence[str] | None = None) -> plotly.gr
     names = [f"cloud {i}" for i in range(len(clouds))] if names is None else names
     if len(names) != len(clouds):
         raise ValueError(f"names: expected {len(clouds)}, one per cloud, got {len(names)}")
-    fraction = min(1.0, _MOST_POINTS / max(sum(len(cloud) for cloud in clouds), 1))
+    drawn = [drawing.drawable(f"clouds[{i}]", cloud) for i, cloud in enumerate(clouds)]
+    fraction = min(1.0, _MOST_POINTS / max(sum(map(len, drawn)), 1))
     layout = {"scene": {"aspectmode": "data"}, "legend": {"itemsizing": "constant"}, "margin": dict.fromkeys("lrtb", 0)}
     figure = graphs.Figure(layout=layout)
-    for i, (cloud, name) in enumerate(zip(clouds, names, strict=True)):
-        cloud = drawing.drawable(f"clouds[{i}]", cloud)
+    for i, (cloud, name) in enumerate(zip(drawn, names, strict=True)):
         rows = np.random.default_rng(0).permutation(len(cloud))[: round(fraction * len(cloud))]
         rgb, intensity = drawing.rgb_of(cloud), drawing.channels_of(cloud, ("intensity",))
         marker: dict[str, Any] = {"size": 1.5, "color": _COLORS[i % len(_COLORS)]}
