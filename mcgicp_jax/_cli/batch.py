@@ -27,6 +27,7 @@ from tqdm import tqdm
 import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax._cli import options as cli
+from mcgicp_jax._cli.choices import Choices, listed, with_channels
 from mcgicp_jax._compute.messages import check_integer
 from mcgicp_jax._pairs.processes import Processes
 from mcgicp_jax._pose_solver.degeneracy import as_text
@@ -130,7 +131,7 @@ def _pairs_in(path: Path, glob: str) -> dict[Key, Float[np.ndarray, "4 4"] | Non
     if not any(map(str.strip, lines)):
         raise ValueError(f"{path}: the file is empty")
     if not {"source", "target"} <= set(columns):
-        raise ValueError(f"{path}: expected the columns source and target, got {cli.listed(columns)}")
+        raise ValueError(f"{path}: expected the columns source and target, got {listed(columns)}")
     missing = [name for name in _POSE if name not in columns]
     # Or else a misspelt column would leave out all initial poses.
     if missing and any(re.fullmatch(r"m\d\d", name.lower()) for name in columns):
@@ -169,7 +170,7 @@ def _reader_and_arguments(
             errors.append(error)
     else:
         raise ValueError(f"0 of {len(errors):,} pairs can be read; the first error: {errors[0]}")
-    choices = cli.Choices(options, names, (source, target))
+    choices = Choices(options, names, (source, target))
     name = choices.method_name(method)
     size = None if options.voxel_size == "off" else options.voxel_size
     print(f"points:    {choices.voxels}{' in the first pair' if size == 'auto' else ''}")
@@ -180,7 +181,7 @@ def _reader_and_arguments(
 
 def _read(channels: Sequence[str], columns: int | None, path: Path) -> mcg.PointCloud:
     try:
-        return cli.with_channels(io.read(path, columns=columns), channels)
+        return with_channels(io.read(path, columns=columns), channels)
     except ValueError as error:
         raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from error
 
@@ -259,9 +260,7 @@ def _read_rows(path: Path) -> list[Row]:
         raise ValueError(f"{path}: expected a table of mcgicp batch, got the columns {reader.fieldnames}")
     rows = list(reader)
     if unknown := {row["status"] for row in rows} - set(mcg.Status.__members__):
-        raise ValueError(
-            f"{path}: expected statuses of mcgicp batch, such as CONVERGED, got {cli.listed(sorted(unknown))}"
-        )
+        raise ValueError(f"{path}: expected statuses of mcgicp batch, such as CONVERGED, got {listed(sorted(unknown))}")
     return rows
 
 

@@ -13,6 +13,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io
 from mcgicp_jax import plot as plots
 from mcgicp_jax._cli import options as cli
+from mcgicp_jax._cli.choices import Choices
 
 
 @cli.with_names
@@ -49,7 +50,7 @@ def multiway(
     paths = cli.clouds_in(folder, glob, map).paths
     raw = [io.read(path, columns=shared.columns) for path in paths]
     names = [path.name for path in paths]
-    choices = cli.Choices(shared, names, raw, target=0)
+    choices = Choices(shared, names, raw, target=0)
     others = zip(names[2:], raw[2:], strict=True)
     clouds = [*choices.preprocessed, *(choices.preprocess(name, cloud) for name, cloud in others)]
     print(f"clouds:    {len(clouds)}, {len(raw[0]):,} points in the first, {len(clouds[0]):,} used ({choices.voxels})")

@@ -20,6 +20,7 @@ import mcgicp_jax as mcg
 from mcgicp_jax import io, metrics
 from mcgicp_jax import plot as plots
 from mcgicp_jax._cli import options as cli
+from mcgicp_jax._cli.choices import Choices, with_channels
 from mcgicp_jax._clouds.voxel_map import VoxelMap
 from mcgicp_jax._clouds.voxel_size import map_voxel_size
 from mcgicp_jax._compute.messages import check_integer
@@ -130,7 +131,7 @@ def odometry(
     with contextlib.suppress(ValueError, OSError):
         start.append(frames[1].cloud)
     names = frames.name(0), frames.name(1)
-    choices = cli.Choices(shared, names, start, target=0)
+    choices = Choices(shared, names, start, target=0)
     name = choices.method_name(method)
     print(f"points:    {choices.voxels}")
     defaults = {"max_distance": DATASETS[dataset].max_distance} if isinstance(dataset, str) else {}
@@ -144,7 +145,7 @@ def odometry(
         for frame in frames:
             truth.append(frame.pose)
             times.append(frame.time)
-            yield cli.with_channels(frame.cloud, choices.channels)
+            yield with_channels(frame.cloud, choices.channels)
 
     steps = mcg.odometry(clouds(), resolved_method, voxel_size=choices.voxels.size, **options)
     poses, results, failure = _follow(steps, frames, loops, map)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 import mcgicp_jax as mcg
 from mcgicp_jax import datasets, io, metrics, plot
 from mcgicp_jax._cli import options as cli
+from mcgicp_jax._cli.choices import Choices, with_channels
 from mcgicp_jax._compute.messages import warn, warnings_named
 from mcgicp_jax._compute.threads import side_by_side
 from mcgicp_jax._local_geometry.cloud_statistics import point_spacing
@@ -55,7 +56,7 @@ class PreparedPair:
         read = partial(io.read, columns=options.columns)
         self.raw = read(source), read(target)
         names = str(source), str(target)
-        self.choices = cli.Choices(options, names, self.raw)
+        self.choices = Choices(options, names, self.raw)
         self.preprocessed = self.choices.preprocessed
         in_source, in_target = (f"{len(self.preprocessed[side]):,} of {len(self.raw[side]):,}" for side in (0, 1))
         print(f"points:    source {in_source}, target {in_target} ({self.choices.voxels})")
@@ -68,7 +69,7 @@ class PreparedPair:
     def find_start(self) -> None:
         if self.options.init != "global":
             return
-        result = mcg.global_pose(*(cli.with_channels(cloud, self.choices.channels) for cloud in self.raw))
+        result = mcg.global_pose(*(with_channels(cloud, self.choices.channels) for cloud in self.raw))
         if not result.num_inliers:
             raise ValueError(doubt_of_global_pose(result))
         verdict = "found" if result.success else "ambiguous" if result.ambiguous else "unsure"
@@ -94,9 +95,9 @@ class PreparedPair:
         # Cells are made of all points.
         source, target = self.preprocessed
         if "source" in method.needs_covariances:
-            source = cli.with_channels(self.raw[0], self.choices.channels)
+            source = with_channels(self.raw[0], self.choices.channels)
         if "target" in method.needs_covariances:
-            target = cli.with_channels(self.raw[1], self.choices.channels)
+            target = with_channels(self.raw[1], self.choices.channels)
         init = None if self.options.init is None else self.start
         return verified(mcg.register(source, target, method, init=init, **self.arguments(name)), self.verified)
 

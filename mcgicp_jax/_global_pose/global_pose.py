@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.spatial import KDTree
+from jaxtyping import Float
 
 from mcgicp_jax._clouds.point_cloud import PointCloud, Values, as_cloud, same_channels
 from mcgicp_jax._clouds.preprocess import finite_rows, with_neighbors
@@ -20,9 +18,9 @@ from mcgicp_jax._compute.messages import check_positive, messages_named
 from mcgicp_jax._compute.threads import with_settings_of_package
 from mcgicp_jax._global_pose import robust_pose_fit as fit
 from mcgicp_jax._global_pose.features import NUM_NEIGHBORS, matches_of_features, matches_of_rows
+from mcgicp_jax._global_pose.free_space import View
 from mcgicp_jax._local_geometry.surface_agreement import spreads, surface_agreement
 from mcgicp_jax._math.poses import inverse, nearest_rotation
-from mcgicp_jax._math.statistics import spread_rows
 from mcgicp_jax._methods.icp import GICP
 from mcgicp_jax._methods.multichannel_gicp import MultiChannelGICP
 from mcgicp_jax._registration.options import Options
@@ -70,14 +68,6 @@ _FREER_OVERLAP, _FREER_AGREEMENT, _FREER_POINTS = 0.5, 0.1, 0.15
 _IN_FREE_SPACE, _LEAST_SEEN = 0.0025, 1000
 # Number of normals that the axes of half turns are computed from, as many as `surface_agreement` compares.
 _NORMALS = 2048
-# Sizes of the samples of the scan that sees, and of the one that is seen.
-_RAYS, _POINTS = 20_000, 4000
-# A point is in free space if each of the `_AROUND` nearest rays ends beyond (1 + `_FARTHER`) times its range, and a
-# voxel. With eight rays, most of which are of one scan line, points at edges count at the right pose, and objects at
-# turned ones do not.
-_AROUND, _FARTHER = 24, 0.1
-# A direction is seen if its `_AROUND` rays are not farther away than this quantile of the same distance in the scan.
-_SEEN = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +79,8 @@ class Candidate:
         num_inliers: number of matches whose points are at most 1.5 voxels apart at this pose.
         overlap: fraction of the source's voxels with a voxel of the target within 1.5 voxels.
         agreement, support: (a/m)² and the support, see `GlobalPoseResult.support`.
-        in_free_space: fraction of both scans' points that lie where the other scan saw through; computed if
-            it matters. NaN if the scans hardly see each other's directions.
+        in_free_space: fraction of both scans' points that lie where the other scan saw through, see `View`;
+            computed if it matters. NaN if the scans hardly see each other's directions.
     """
 
     matrix: Float[np.ndarray, "4 4"]
@@ -242,7 +232,7 @@ def global_pose(
             voxels[side] = cloud.replace_rows(deferred_neighbors=DeferredRows.of(neighbors))
         positions = np.asarray(voxels[0].points, np.float64)
         radius = float(np.sqrt(np.mean(np.sum(positions * positions, axis=1))))
-        views = [_View(np.asarray(cloud.points), -center) for cloud, center in zip(clouds, centers, strict=True)]
+        views = [View(np.asarray(cloud.points), -center) for cloud, center in zip(clouds, centers, strict=True)]
         return _best_pose(_Scene(matches, voxels[0], voxels[1], size, radius, *views), *centers)
 
 
@@ -287,48 +277,6 @@ def _voxel_size(clouds: list[PointCloud]) -> float:
     return float(2.0 ** (high / _STEPS_PER_OCTAVE))
 
 
-class _View:
-    """What a scan saw from its origin.
-
-    Args:
-        points: (N, 3) metres.
-        origin: (3,) position of the sensor, metres. If the sensor was not there, as in maps, right poses have points in
-            free space, too.
-    """
-
-    def __init__(self, points: Float[np.ndarray, "N 3"], origin: Float[np.ndarray, "3"]):
-        self.points, self._origin = points, origin
-
-    @cached_property
-    def _rays(self) -> tuple[KDTree, Float[np.ndarray, "n"], float]:
-        """Directions and lengths of rays, and the largest distance to the rays of a direction that is seen."""
-        directions, ranges = self._polar(_sample(self.points, _RAYS))
-        tree = KDTree(directions)
-        around = tree.query(_sample(directions, _POINTS), k=[min(_AROUND, len(ranges))])[0]
-        return tree, ranges, float(np.quantile(around, _SEEN))
-
-    def _polar(self, points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
-        offsets = points - self._origin
-        ranges = np.linalg.norm(offsets, axis=1)
-        return offsets / np.maximum(ranges, np.finfo(np.float32).tiny)[:, None], ranges
-
-    def sees_through(self, other: _View, matrix: Float[np.ndarray, "4 4"], margin: float) -> Int[np.ndarray, "2"]:
-        """Numbers of a sample of the other scan's points that are in free space, and in directions that this one sees.
-
-        `matrix` is the pose of the other scan in this one's frame; `margin`, metres, is the least distance behind.
-        """
-        tree, lengths, seen = self._rays
-        directions, ranges = self._polar(_sample(other.points, _POINTS) @ matrix[:3, :3].T + matrix[:3, 3])
-        distances, rays = tree.query(directions, k=np.arange(1, 1 + min(_AROUND, len(lengths))))
-        inside = distances[:, -1] <= seen
-        free = lengths[rays].min(axis=1) > (1 + _FARTHER) * ranges + margin
-        return np.array([np.sum(free & inside), np.sum(inside)])
-
-
-def _sample(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "n 3"]:
-    return points[spread_rows(np.ones(len(points), bool), count)] if len(points) > count else points
-
-
 class _Scene(NamedTuple):
     """Matches of two centred clouds of voxels."""
 
@@ -338,8 +286,8 @@ class _Scene(NamedTuple):
     voxel_size: float
     # Root mean square distance of the source's points from the centre, about which poses turn, metres.
     radius: float
-    source_view: _View
-    target_view: _View
+    source_view: View
+    target_view: View
 
     def are_same(self, a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> bool:
         square = fit.squared_separation((a - b)[:3, :3], (a - b)[:3, 3], self.radius)

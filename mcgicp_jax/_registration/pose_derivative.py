@@ -84,7 +84,7 @@ class PoseDerivative(AbstractLinearMap):
     `inputs`; by default, by all that are traced. Those of `run` are the same inputs, concrete."""
 
     def __init__(self, inputs: Inputs, run: Run, arrays: Sequence[Any] = ()):
-        fixed, problem, loop = run[:3]
+        fixed, problem, loop = run.inputs, run.problem, run.loop
         self._pose, self._fusion = np.asarray(loop.state.pose.wxyz_xyz), problem.fusion
         root = _root_on_host(loop.state._replace(record=None), self._fusion)
         self._scaling: ImplicitRoot = jax.tree.map(np.asarray, root)
